@@ -19,8 +19,9 @@ from scipy import ndimage
 
 from benchmarks.timing import interleaved_medians_s
 from benchmarks.volumes import FLOWS, Flow, Seeding, Triple, volume_pair
-from lfpiv_cli.flow.correlation import CorrelationSettings, correlate
+from lfpiv_cli.flow.correlation import correlate
 from lfpiv_cli.flow.field import VALID, VectorField
+from lfpiv_cli.flow.windows import CorrelationSettings
 from lfpiv_cli.grid import Grid
 
 SHAPE = (100, 130, 100)

@@ -6,8 +6,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lfpiv_cli.flow.correlation import CorrelationSettings, correlate
+from lfpiv_cli.flow.correlation import correlate
 from lfpiv_cli.flow.field import REJECTED
+from lfpiv_cli.flow.windows import CorrelationSettings
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.camera import Camera, Lattice
 from lfpiv_cli.optics.media import Media

@@ -34,6 +34,9 @@ Method = Literal[TracedMethod, "dlfc"]
 Refraction = Literal["paraxial", "exact"]
 Sampling = Literal["exact", "rays"]
 
+# How voxels count by their place in an interrogation window.
+Weighting = Literal["uniform", "gaussian"]
+
 # The section whose walls mask what lies beyond them.
 Mask = Literal["channel", "pipe"]
 

@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from lfpiv_cli.errors import ConfigError, InputError
-from lfpiv_cli.flow.correlation import CorrelationSettings, correlate, count_passes
+from lfpiv_cli.flow.correlation import correlate, count_passes
 from lfpiv_cli.flow.deformation import (
     SLACK,
     SPLINE_PAD,
@@ -18,9 +18,9 @@ from lfpiv_cli.flow.deformation import (
     spline_matrix,
 )
 from lfpiv_cli.flow.field import MASKED, REJECTED, VectorField
-from lfpiv_cli.flow.maps import map_sums, margins
 from lfpiv_cli.flow.peaks import find_peaks, vertex
-from lfpiv_cli.flow.windows import layout_windows
+from lfpiv_cli.flow.sums import map_sums, margins
+from lfpiv_cli.flow.windows import CorrelationSettings, layout_windows
 from lfpiv_cli.grid import Grid
 
 HALF = (0.5, 0.5, 0.5)
@@ -117,7 +117,7 @@ def test_maps_are_the_symmetric_normalised_correlation(
         slices = tuple(slice(s, s + layout.size[xyz]) for s, xyz in zip(start, (2, 1, 0), strict=True))
         return volume[slices].astype(np.float64)
 
-    last = tuple(n - 1 for n in layout.count_zyx)
+    last = tuple(n - 1 for n in layout.count[::-1])
     for index, shift in (((0, 0, 0), (1, -2, 2)), (last, (2, 0, -1)), ((1, 0, 1), (0, 0, 0))):
         back = tuple(-s for s in shift)
         here_a, here_b = window(padded_a, index, (0, 0, 0)), window(padded_b, index, (0, 0, 0))

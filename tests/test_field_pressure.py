@@ -11,7 +11,7 @@ from benchmarks.field_tracks import tracks_of
 from benchmarks.pressure import sequence_of, trial
 from lfpiv_cli.errors import ConfigError, InputError, UsageError
 from lfpiv_cli.fields import pressure, stencils
-from lfpiv_cli.fields.pressure import laplacian_at, lattice_over, pressure_field, pressure_gradients
+from lfpiv_cli.fields.pressure import laplacian_at, pressure_field, pressure_gradients
 from lfpiv_cli.fields.samples import Samples
 from lfpiv_cli.fields.spline_field import spline_field
 from lfpiv_cli.fields.stencils import Lattice
@@ -208,7 +208,7 @@ def test_the_laplacian_is_the_divergence_of_gradients(rng):
 
 
 def test_knots_are_bounded():
-    assert int(np.prod(lattice_over((0, 0, 0), (13, 10, 10), 0.1).shape)) <= 3000
+    assert int(np.prod(Lattice.affordable((0, 0, 0), (13, 10, 10), 0.1).shape)) <= 3000
 
 
 def sequence_files(rng, step_mm=0.2, count=200):

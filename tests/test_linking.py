@@ -10,8 +10,7 @@ import pytest
 from benchmarks.links import SCALE, Turbulence, shares
 from lfpiv_cli.synthetic.flows import random_modes
 from lfpiv_cli.tracks.candidates import Candidates, Light, Seen, light_ratio
-from lfpiv_cli.tracks.gridding import on_grid
-from lfpiv_cli.tracks.kriging import Structure, kriged, structure_of
+from lfpiv_cli.tracks.gridding import Structure, kriged, on_grid, structure_of
 from lfpiv_cli.tracks.tracking import (
     ALONE,
     LEAST_LIGHT_RATIO,

@@ -6,8 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from lfpiv_cli.flow.correlation import CorrelationSettings, correlate
+from lfpiv_cli.flow.correlation import correlate
 from lfpiv_cli.flow.peaks import LOCKING_LENSES, with_locking
+from lfpiv_cli.flow.windows import CorrelationSettings
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.reference import Reference
 from lfpiv_cli.scale import Scale

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lfpiv_cli.flow.windows import ParallelWalls, RoundWall, inside, rectangle_in_circle
+from lfpiv_cli.flow.windows import ParallelWalls, RoundWall, inside
 from lfpiv_cli.grid import Grid
 
 
@@ -33,10 +33,11 @@ def test_windows_count_as_far_as_they_lie_between_the_walls() -> None:
     np.testing.assert_allclose(share, [0.25, 0.75, 1.0, 0.75, 0.25])
 
 
-def test_rectangle_in_circle_is_what_lies_in_both(rng: np.random.Generator) -> None:
+def test_a_slice_of_a_box_in_a_pipe_is_what_lies_in_both(rng: np.random.Generator) -> None:
     low = rng.uniform(-1.5, 1.0, (40, 2))
     high = low + rng.uniform(0.0, 2.0, (40, 2))
-    area = rectangle_in_circle(low[:, 0], high[:, 0], low[:, 1], high[:, 1])
+    slices = np.insert(low, 0, 0.0, axis=1), np.insert(high, 0, 1.0, axis=1)
+    area = RoundWall(1.0).volumes_mm3(*slices)
     # cells of 1/200 of a side: of those that the circle cuts half count too much and half too little
     share = (np.arange(200) + 0.5) / 200
     x, y = (low[:, axis, np.newaxis] + share * (high - low)[:, axis, np.newaxis] for axis in range(2))
@@ -44,7 +45,7 @@ def test_rectangle_in_circle_is_what_lies_in_both(rng: np.random.Generator) -> N
         high - low, axis=1
     )
     np.testing.assert_allclose(area, counted, atol=4e-3)
-    assert rectangle_in_circle(*(np.array(side) for side in (-2.0, 2.0, -1.0, 3.0))) == np.float64(np.pi)
+    assert RoundWall(1.0).volumes_mm3(np.array([0.0, -2.0, -1.0]), np.array([1.0, 2.0, 3.0])) == np.float64(np.pi)
 
 
 PIPE = RoundWall(1.3, (0.4, -0.2, 0.3), "x")

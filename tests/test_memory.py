@@ -12,7 +12,8 @@ from lfpiv_cli.errors import OutputError
 from lfpiv_cli.files import inputs
 from lfpiv_cli.files.config import load_config
 from lfpiv_cli.files.vtkhdf import write_volume
-from lfpiv_cli.flow.correlation import CorrelationSettings, held_bytes
+from lfpiv_cli.flow.correlation import held_bytes
+from lfpiv_cli.flow.windows import CorrelationSettings
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.reference import FOCAL_POINT
 from lfpiv_cli.validation.planning import depth_of_field_mm

@@ -31,6 +31,7 @@ from lfpiv_cli.names import (
     RunMethod,
     Sampling,
     Start,
+    Weighting,
     names_in,
 )
 from lfpiv_cli.reconstruction.registry import PARTICLES, SOLVER_NAMES, SOLVERS
@@ -53,6 +54,7 @@ OPTIONS = {
     ("reconstruct", "start"): names_in(Start),
     ("reconstruct", "pairing"): names_in(Pairing),
     ("correlate", "pairing"): names_in(Pairing),
+    ("correlate", "weighting"): names_in(Weighting),
     ("field", "divergence"): names_in(Divergence),
     ("track", "by"): names_in(GridMethod),
     ("track", "pairing"): names_in(Pairing),

@@ -7,7 +7,7 @@ import pytest
 
 from lfpiv_cli.files.particle_file import POSITION
 from lfpiv_cli.tracks.candidates import NO_TRACK, Seen, Trajectories
-from lfpiv_cli.tracks.in_time import scatter_of, scatter_of_pieces
+from lfpiv_cli.tracks.in_time import scatter_of
 from lfpiv_cli.tracks.sequences import states_at
 from lfpiv_cli.verbs.tracks import SequenceTracks
 
@@ -70,8 +70,8 @@ def test_scatter_is_that_of_all_pieces(cuts: list[int], rng: np.random.Generator
     sigma = rng.uniform(5e-3, 2e-2, position.shape)
     missed = rng.random((300, 5)) < 0.3
     position[missed], sigma[missed] = np.nan, np.nan
-    whole = scatter_of(position, sigma, time)
-    pieces = scatter_of_pieces(zip(np.split(position, cuts), np.split(sigma, cuts), strict=True), time)
+    whole = scatter_of([(position, sigma)], time)
+    pieces = scatter_of(zip(np.split(position, cuts), np.split(sigma, cuts), strict=True), time)
     assert whole.noise_known
     assert whole.bending_known
     np.testing.assert_array_equal(pieces.noise, whole.noise)

@@ -166,11 +166,11 @@ def test_parabolas_are_taken_exactly_and_lines_are_lines(frames: int, rng: np.ra
     start, velocity, bend = rng.normal(0.0, 1.0, (3, 200, 1, 3)) * np.array([5.0, 0.2, 0.02]).reshape(3, 1, 1, 1)
     places = start + velocity * time[:, np.newaxis] + 0.5 * bend * time[:, np.newaxis] ** 2
     sigma = np.full(places.shape, 1e-6)
-    state = fit_in_time(places, sigma, time, scatter_of(places, sigma, time))
+    state = fit_in_time(places, sigma, time, scatter_of([(places, sigma)], time))
     np.testing.assert_allclose(state.velocity, velocity[:, 0], atol=1e-6)
     straight = places - 0.5 * bend * time[:, np.newaxis] ** 2
     noisy, sigma = straight + rng.normal(0.0, 0.01, straight.shape), np.full(straight.shape, 0.01)
-    scatter = scatter_of(noisy, sigma, time)
+    scatter = scatter_of([(noisy, sigma)], time)
     # Of 200 tracks the noise is known to 8 %; what that leaves of a bending is half of the noise of one, at most.
     assert np.all(np.sqrt(scatter.bending) < 0.5 * 0.01 * {3: 2.45, 7: 0.218}[frames])
     state = fit_in_time(noisy, sigma, time, Scatter.unknown())
@@ -181,7 +181,7 @@ def test_parabolas_are_taken_exactly_and_lines_are_lines(frames: int, rng: np.ra
 
 def test_noise_that_is_not_as_stated_is_found(rng: np.random.Generator) -> None:
     noisy, sigma, time = rng.normal(0.0, 0.02, (400, 7, 3)), np.full((400, 7, 3), 0.01), np.arange(7.0) - 3.0
-    scatter = scatter_of(noisy, sigma, time)
+    scatter = scatter_of([(noisy, sigma)], time)
     # 1,600 degrees of freedom a component: 3 %, and medians tell half as much.
     np.testing.assert_allclose(scatter.noise, 2.0, rtol=0.1)
     state = fit_in_time(noisy, sigma, time, scatter)
@@ -196,7 +196,7 @@ def test_velocities_on_circles_are_within_their_errors(rng: np.random.Generator,
     angle = phase + 0.17 * time
     places = np.stack([radius * np.cos(angle), 0.0 * angle, radius * np.sin(angle)], axis=2)
     noisy, sigma = places + sigma_mm * rng.normal(size=places.shape), np.broadcast_to(sigma_mm, places.shape)
-    scatter = scatter_of(noisy, sigma, time)
+    scatter = scatter_of([(noisy, sigma)], time)
     state = fit_in_time(noisy, sigma, time, scatter)
     truth = 0.17 * radius * np.stack([-np.sin(phase), 0.0 * phase, np.cos(phase)], axis=2)[:, 0]
     covered = np.mean(np.abs(state.velocity - truth) < 1.96 * state.velocity_sigma, axis=0)

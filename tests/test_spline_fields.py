@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 
-from lfpiv_cli.fields import spline_field, stencils
+from lfpiv_cli.fields import stencils
 from lfpiv_cli.fields.evidence import first_expectation, most_probable
 from lfpiv_cli.fields.fit import FEW_SAMPLES, Field, fit_field
 from lfpiv_cli.fields.samples import Samples, belonging, with_places, without_itself
@@ -323,7 +323,7 @@ def test_wrong_links_lose_their_weight() -> None:
 
 @pytest.mark.thorough
 def test_flows_that_splines_cannot_follow_are_kriged(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(spline_field, "MOST_UNKNOWNS", 200)
+    monkeypatch.setattr(stencils, "MOST_SPLINES", 66)
     samples, points = tracks(vortices, MANY, 18), inner(100, 18)
     assert fit_field(samples, LOW, HIGH).told()["method"] == "kriging"
     free = fitted(samples, "free")

@@ -155,9 +155,10 @@ def board_notices(pose: BoardPose, board: BoardGeometry, camera: Camera, media: 
         yield Notice("board-few-points", "board", text, remedy, float(found), f"at least {ENOUGH_POINTS}")
     shown, sheet = pose.magnification, camera.magnification
     if abs(shown / sheet - 1.0) > MAGNIFICATION_TOLERANCE:
-        text = f"the board shows a magnification of {written(shown, 4)}, which is used; the rig file says {written(sheet, 4)}"
+        expected = written(sheet, 4)
+        text = f"the board shows a magnification of {written(shown, 4)}, which is used; the rig file says {expected}"
         remedy = "correct what is off of board.spacing_mm, board.medium and main_lens.magnification"
-        expected = f"{written(sheet, 4)} within {MAGNIFICATION_TOLERANCE:.0%}"
+        expected += f" within {MAGNIFICATION_TOLERANCE:.0%}"
         yield Notice("magnification", "board.spacing_mm", text, remedy, shown, expected)
     depth, largest = field_depth(pose, camera), LARGEST_FIELD_DEPTH * lens_in_scene_mm(camera)[1]
     if depth is not None and depth.beyond(largest):

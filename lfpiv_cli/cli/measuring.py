@@ -31,7 +31,7 @@ from lfpiv_cli.cli.options import (
 )
 from lfpiv_cli.console import Console
 from lfpiv_cli.errors import UsageError
-from lfpiv_cli.names import Divergence, GridMethod, Kept, RunMethod, Start, names_in
+from lfpiv_cli.names import Divergence, GridMethod, Kept, RunMethod, Start, Weighting, names_in
 from lfpiv_cli.reconstruction.registry import SOLVER_NAMES
 
 
@@ -197,6 +197,9 @@ def _window(text: str) -> int | tuple[int, ...]:
 @dt_option
 @click.option("--windows", callback=parse_windows, help="Interrogation windows in voxels, coarse to fine, as 32,16.")
 @click.option("--overlap", type=click.FloatRange(min=0.0, max=1.0, max_open=True), help="Of neighbouring windows.")
+@click.option(
+    "--weighting", type=click.Choice(names_in(Weighting)), help="How voxels count by their place in a window."
+)
 @pairing_options
 @click.option("--mask", "mask_volume", type=FILE, help="Volume on the same grid: voxels of 0 are left out.")
 @click.option("--ensemble", is_flag=True, help="One field of all pairs together, for a flow that does not change.")

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import ClassVar, Self
 
 import numpy as np
@@ -19,7 +20,7 @@ from scipy.linalg import cho_factor, cho_solve
 from lfpiv_cli.arrays import Floats
 from lfpiv_cli.fields import stencils
 from lfpiv_cli.fields.samples import Samples, belonging, error_covariance, without_itself
-from lfpiv_cli.fields.stencils import DIVERGENCE, ORDERS, Expectation, Lattice, bound, inverse_of, penalty, spread_of
+from lfpiv_cli.fields.stencils import DIVERGENCE, ORDERS, Expectation, Lattice, bound, inverse_of, penalty
 from lfpiv_cli.threads import in_threads
 
 # Cells of a box along each axis: some thousand unknowns.
@@ -125,7 +126,9 @@ def boxes_in(samples: Samples, lattice: Lattice, rng: np.random.Generator, kind:
 
 def first_expectation(samples: Samples, lattice: Lattice, names: Sequence[str], kind: type[Box] = Box) -> Expectation:
     """Return what lets any field pass that varies by the samples' spread within a few cells."""
-    spread = spread_of(samples.value_mm)
+    # By how much samples differ: 1.48 times the median distance from their median.
+    off = np.abs(samples.value_mm - np.median(samples.value_mm, axis=0))
+    spread = max(float(1.4826 * np.median(off.max(axis=1))), np.finfo(np.float64).tiny)
     size = BOX_CELLS * float(np.min(lattice.cell_mm))
     reach = spread * size**kind.integrals
     powers = {name: 2 if name == DIVERGENCE else 2 * ORDERS[name] for name in names}
@@ -148,8 +151,20 @@ def most_probable(
     beliefs, first = [box.samples.probability for box in boxes], expected
     last = np.zeros(len(names))
     for _ in range(ROUNDS):
-        updated, told = _updated(boxes, expected, beliefs, parts, bounded)
-        beliefs = [each.belief for each in told]
+        before = bounded + sum(weight * parts[name] for name, weight in expected.weights.items())
+        tell = partial(_told, expected, parts, before, _inverse(before)[0])
+        told = in_threads(tell, list(zip(boxes, beliefs, strict=True)))
+        had, decided = (np.sum([each[number] for each in told], axis=0) for number in range(2))
+        beliefs = [each[2] for each in told]
+        change = np.maximum(decided, SMALLEST_SHARE * had) / np.maximum(had, np.finfo(np.float64).tiny)
+        change[: len(names)] = np.clip(change[: len(names)], 1.0 / LARGEST_STEP, LARGEST_STEP)
+        scales = np.sqrt(np.clip(1.0 / change[len(names) :], 1.0 / LARGEST_STEP, LARGEST_STEP))
+        updated = Expectation(
+            {name: expected.weights[name] * float(change[number]) for number, name in enumerate(names)},
+            expected.spread_mm,
+            max(expected.scale * float(scales[0]), SMALLEST_SCALE),
+            max(expected.unresolved_mm * float(scales[1]), SMALLEST_UNRESOLVED * expected.spread_mm),
+        )
         step = np.array([np.log(updated.weights[name] / expected.weights[name]) for name in names])
         further = np.where(step * last > 0.0, ONWARD * step, 0.0)
         weights = {name: updated.weights[name] * float(np.exp(more)) for name, more in zip(names, further, strict=True)}
@@ -164,7 +179,7 @@ def most_probable(
         expected, last = onward, step
         if settled:
             break
-    return expected, np.median(np.concatenate([each.by_others for each in told]), axis=0)
+    return expected, np.median(np.concatenate([each[3] for each in told]), axis=0)
 
 
 def divergence_weight(expected: Expectation, lattice: Lattice, times: float) -> float:
@@ -182,97 +197,37 @@ def held(expected: Expectation, lattice: Lattice) -> Expectation:
     return replace(expected, weights={**expected.weights, DIVERGENCE: weight})
 
 
-def _updated(
-    boxes: Sequence[Box],
-    expected: Expectation,
-    beliefs_before: Sequence[Floats],
-    parts: dict[str, Floats],
-    bounded: Floats,
-) -> tuple[Expectation, list[Told]]:
-    """Return weights and scales under which the boxes' samples are more probable, and what the boxes tell."""
-    before = bounded + sum(weight * parts[name] for name, weight in expected.weights.items())
-    before_inverse, _ = _inverse(before)
+def _told(
+    expected: Expectation, parts: dict[str, Floats], before: Floats, before_inverse: Floats, of_box: tuple[Box, Floats]
+) -> tuple[Floats, Floats, Floats, Floats]:
+    """Return what a box, with its samples' probabilities, tells: of penalties, stated errors and what is unresolved.
 
-    def tell(box: Box, belief: Floats) -> Told:
-        return _told(box, belief, expected, parts, before, before_inverse)
-
-    told = in_threads(lambda pair: tell(*pair), list(zip(boxes, beliefs_before, strict=True)))
-    had, decided = (np.sum([getattr(each, name) for each in told], axis=0) for name in ("had", "decided"))
-    tiny = np.finfo(np.float64).tiny
-    change = np.maximum(decided, SMALLEST_SHARE * had) / np.maximum(had, tiny)
-    change[: len(parts)] = np.clip(change[: len(parts)], 1.0 / LARGEST_STEP, LARGEST_STEP)
-    scales = np.sqrt(np.clip(1.0 / change[len(parts) :], 1.0 / LARGEST_STEP, LARGEST_STEP))
-    updated = Expectation(
-        {name: expected.weights[name] * float(change[number]) for number, name in enumerate(parts)},
-        expected.spread_mm,
-        max(expected.scale * float(scales[0]), SMALLEST_SCALE),
-        max(expected.unresolved_mm * float(scales[1]), SMALLEST_UNRESOLVED * expected.spread_mm),
-    )
-    return updated, told
-
-
-@dataclass(frozen=True, eq=False)
-class Told:
-    """What a box tells: of each penalty, of the stated errors and of what is left unresolved.
-
-    Attributes
-    ----------
+    Returns
+    -------
     had : what the field and the errors have of each
     decided : how many degrees of freedom each decides
     belief : (n,) the samples' probabilities to belong to the field
     by_others : (n, 3, 3) covariances of the field that each sample's neighbours make without it
     """
-
-    had: Floats
-    decided: Floats
-    belief: Floats
-    by_others: Floats
-
-
-def _told(
-    box: Box, belief: Floats, expected: Expectation, parts: dict[str, Floats], before: Floats, before_inverse: Floats
-) -> Told:
-    """Return what a box tells of the weights and scales."""
+    box, belief = of_box
     covariance = error_covariance(box.samples, expected.scale, expected.unresolved_mm)
     weight = belief[:, np.newaxis, np.newaxis] * np.linalg.inv(covariance)
-    coefficients, inverse = _fit(box, before, weight)
-    by_data = before_inverse - inverse
+    matrix, right = box.normal(weight)
+    inverse, factor = _inverse(matrix + before)
+    coefficients, by_data = cho_solve(factor, right), before_inverse - inverse
     had = [expected.weights[name] * float(coefficients @ (part @ coefficients)) for name, part in parts.items()]
     decided = [expected.weights[name] * float(np.vdot(by_data, part)) for name, part in parts.items()]
     error, field = box.samples.value_mm - box.field(coefficients), box.covariance(inverse)
-    errors_had, errors_decided = _error_parts(box, error, field, weight, belief, expected)
-    alone = without_itself(error, field, weight, covariance)
-    return Told(
-        np.array([*had, *errors_had]),
-        np.array([*decided, *errors_decided]),
-        belonging(box.samples, *alone, expected.spread_mm),
-        alone[1] - covariance,
-    )
-
-
-def _fit(box: Box, before: Floats, weight: Floats) -> tuple[Floats, Floats]:
-    """Return the coefficients of the field through a box' samples, and their covariance."""
-    matrix, right = box.normal(weight)
-    inverse, factor = _inverse(matrix + before)
-    return cho_solve(factor, right), inverse
-
-
-def _error_parts(
-    box: Box, error: Floats, field: Floats, weight: Floats, probability: Floats, expected: Expectation
-) -> tuple[Floats, Floats]:
-    """Return what the errors have of the stated ones and of the unresolved, and what they would be expected to have."""
-    weighted = np.einsum("nij,nj->ni", weight, error)
-    shares = np.maximum(probability, np.finfo(np.float64).tiny)
-    had, expects = np.zeros(2), np.zeros(2)
-    kinds = (
-        expected.scale**2 * box.samples.covariance_mm2,
-        np.broadcast_to(expected.unresolved_mm**2 * np.eye(3), weight.shape),
-    )
-    for number, kind in enumerate(kinds):
-        had[number] = np.sum(np.einsum("ni,nij,nj->n", weighted, kind, weighted) / shares)
+    # What the errors have of the stated ones and of the unresolved, and what they would be expected to have.
+    weighted, shares = np.einsum("nij,nj->ni", weight, error), np.maximum(belief, np.finfo(np.float64).tiny)
+    unresolved = np.broadcast_to(expected.unresolved_mm**2 * np.eye(3), weight.shape)
+    for kind in (expected.scale**2 * box.samples.covariance_mm2, unresolved):
+        had.append(float(np.sum(np.einsum("ni,nij,nj->n", weighted, kind, weighted) / shares)))
         through = np.einsum("nij,njk,nkl->nil", weight, kind, weight) / shares[:, np.newaxis, np.newaxis]
-        expects[number] = np.einsum("nij,nji->", weight, kind) - np.einsum("nij,nji->", through, field)
-    return had, expects
+        decided.append(float(np.einsum("nij,nji->", weight, kind) - np.einsum("nij,nji->", through, field)))
+    alone = without_itself(error, field, weight, covariance)
+    belief = belonging(box.samples, *alone, expected.spread_mm)
+    return np.array(had), np.array(decided), belief, alone[1] - covariance
 
 
 def _inverse(matrix: Floats) -> tuple[Floats, tuple[Floats, bool]]:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,7 +17,7 @@ from threadpoolctl import threadpool_limits
 
 from lfpiv_cli.arrays import Floats
 from lfpiv_cli.fields.samples import Samples
-from lfpiv_cli.fields.spline_field import lattice_for, spline_field
+from lfpiv_cli.fields.spline_field import SplineField, lattice_for, spline_field
 from lfpiv_cli.fields.structure import (
     INDEPENDENT,
     Estimates,
@@ -28,8 +29,7 @@ from lfpiv_cli.fields.structure import (
     unknown_variance,
 )
 from lfpiv_cli.robust import MAD_TO_SIGMA
-from lfpiv_cli.tracks.gridding import FEWEST_OF_STRUCTURE, ROUGH_EXPONENT
-from lfpiv_cli.tracks.kriging import without_own
+from lfpiv_cli.tracks.gridding import FEWEST_OF_STRUCTURE, ROUGH_EXPONENT, without_own
 
 # A velocity field kriged from samples as vectors: the best linear unbiased estimate where the flow is rough.
 #
@@ -68,8 +68,6 @@ STEPS, ENOUGH = 25, 1e-5
 # What stands for a likelihood of none.
 IMPOSSIBLE = 1e12
 
-Cost = Callable[[Floats, float], float]
-
 
 def spacing_of(points: Floats) -> float:
     """Return the median distance of a point's nearest neighbour, mm."""
@@ -87,57 +85,38 @@ def likeliest_structure(
     shares : of potential flow, to choose from: the first, unless another is clearly likelier
     size : number of neighbourhoods and of samples in each
     """
-    spacing = spacing_of(samples.points_mm)
-    cost, guess = _cost_of(samples, spacing, size), _first_guess(samples, spacing)
-    found = _least(cost, guess, shares[0], guess)
-    # what else is likeliest differs little from share to share
-    other = min(shares, key=lambda share: cost(found, share))
-    if other != shares[0]:
-        better = _least(cost, found, other, guess)
-        if cost(better, other) < cost(found, shares[0]) - NEEDED_GROWTH:
-            return _structure(better, spacing, other)
-    return _structure(found, spacing, shares[0])
-
-
-def _least(cost: Cost, start: Floats, share: float, guess: Floats) -> Floats:
-    """Return the parameters, near some and not too far from the first guess, at which the cost is the smallest."""
-    bounds = list(zip(guess - FARTHEST * DEVIATIONS, guess + FARTHEST * DEVIATIONS, strict=True))
-    options = {"maxiter": STEPS, "ftol": ENOUGH}
-    found = minimize(cost, start, args=(share,), method="L-BFGS-B", bounds=bounds, options=options)
-    return np.asarray(found.x)
-
-
-def _neighbourhoods(points: Floats, number: int, samples_each: int) -> NDArray[np.int64]:
-    """Return the samples (b, k) of neighbourhoods whose middles lie as far from each other as they can."""
-    count = min(samples_each, len(points))
-    middles = [int(np.argmin(np.linalg.norm(points - points.mean(axis=0), axis=1)))]
-    distance = np.linalg.norm(points - points[middles[0]], axis=1)
-    while len(middles) < min(number, max(1, 2 * len(points) // count)):
+    # Neighbourhoods whose middles lie as far from each other as they can.
+    places, count = samples.points_mm, min(size[1], len(samples))
+    middles = [int(np.argmin(np.linalg.norm(places - places.mean(axis=0), axis=1)))]
+    distance = np.linalg.norm(places - places[middles[0]], axis=1)
+    while len(middles) < min(size[0], max(1, 2 * len(places) // count)):
         middles.append(int(np.argmax(distance)))
-        distance = np.minimum(distance, np.linalg.norm(points - points[middles[-1]], axis=1))
-    return np.asarray(KDTree(points).query(points[middles], k=np.arange(1, count + 1))[1])
-
-
-def _cost_of(samples: Samples, spacing: float, size: tuple[int, int]) -> Cost:
-    """Return minus the logarithm of the likelihood, of parameters and the share of potential flow."""
-    near = _neighbourhoods(samples.points_mm, *size)
-    points, errors, values = samples.points_mm[near], samples.covariance_mm2[near], samples.value_mm[near]
+        distance = np.minimum(distance, np.linalg.norm(places - places[middles[-1]], axis=1))
+    near = KDTree(places).query(places[middles], k=np.arange(1, count + 1))[1]
+    points, errors, values = places[near], samples.covariance_mm2[near], samples.value_mm[near]
     about = (values - values.mean(axis=1, keepdims=True)).swapaxes(1, 2).reshape(len(near), -1)
-    guess, unknown = _first_guess(samples, spacing), unknown_variance(samples)
+    unknown, spacing = unknown_variance(samples), spacing_of(places)
+    variance = max(float(np.var(samples.value_mm, axis=0).mean()), np.finfo(np.float64).tiny)
+    first = np.log([DIFFERENCE_SHARE * variance, NUGGET_SHARE * variance])
+    lengths = np.log([INNER_SPACINGS * spacing, OUTER_SPACINGS * spacing])
+    guess = np.array([first[0], np.log(POWER / (2.0 - POWER)), *lengths, first[1], 0.0])
 
     def cost(parameters: Floats, share: float) -> float:
+        """Return minus the logarithm of the likelihood."""
         found = log_likelihood(between(points, errors, _structure(parameters, spacing, share), unknown), about)
         unlikely = 0.5 * float(np.sum(((parameters - guess) / DEVIATIONS) ** 2))
         return unlikely - found if np.isfinite(found) else IMPOSSIBLE
 
-    return cost
-
-
-def _first_guess(samples: Samples, spacing: float) -> Floats:
-    variance = max(float(np.var(samples.value_mm, axis=0).mean()), np.finfo(np.float64).tiny)
-    shares = np.log([DIFFERENCE_SHARE * variance, NUGGET_SHARE * variance])
-    lengths = np.log([INNER_SPACINGS * spacing, OUTER_SPACINGS * spacing])
-    return np.array([shares[0], np.log(POWER / (2.0 - POWER)), *lengths, shares[1], 0.0])
+    bounds = list(zip(guess - FARTHEST * DEVIATIONS, guess + FARTHEST * DEVIATIONS, strict=True))
+    search = partial(minimize, cost, method="L-BFGS-B", bounds=bounds, options={"maxiter": STEPS, "ftol": ENOUGH})
+    found = search(guess, args=(shares[0],)).x
+    # what else is likeliest differs little from share to share
+    other = min(shares, key=lambda share: cost(found, share))
+    if other != shares[0]:
+        better = search(found, args=(other,)).x
+        if cost(better, other) < cost(found, shares[0]) - NEEDED_GROWTH:
+            return _structure(better, spacing, other)
+    return _structure(found, spacing, shares[0])
 
 
 def _structure(parameters: Floats, spacing: float, share: float) -> VectorStructure:
@@ -145,7 +124,7 @@ def _structure(parameters: Floats, spacing: float, share: float) -> VectorStruct
     difference, power, inner, outer, nugget, error = parameters.tolist()
     inner, outer, nugget, error = (math.exp(value) for value in (inner, outer, nugget, error))
     unit = VectorStructure(1.0, 2.0 / (1.0 + math.exp(-power)), inner, outer, nugget, error, share)
-    return unit.scaled(math.exp(difference) / unit.mean_at(spacing))
+    return replace(unit, factor=math.exp(difference) / unit.mean_at(spacing))
 
 
 # Samples that an estimate is made of, and those that show whether one of them is an outlier. With twice as many the
@@ -195,7 +174,7 @@ class KrigedField:
 
     def variance_at(self, points_mm: Floats) -> Floats:
         """Return the variances (m, 3) in mm^2 of what the displacements are off by."""
-        return np.asarray(np.einsum("mii->mi", self.estimates_at(points_mm).covariance_mm2))
+        return self.estimate_at(points_mm)[1]
 
     def estimates_at(self, points_mm: Floats) -> Estimates:
         """Return displacements and their covariances at once, in the time that either takes."""
@@ -205,7 +184,11 @@ class KrigedField:
             for part, near in _nearest(self.samples.points_mm, points_mm, USED)
         ]
         covariance = np.concatenate([part.covariance_mm2 for part in parts])
-        factor = self._error_factor(points_mm)
+        # How large errors are around places over what the equations say.
+        everywhere = MAD_TO_SIGMA * np.median(self.off_by, axis=0)
+        count = min(AROUND, len(self.samples))
+        near = KDTree(self.samples.points_mm).query(points_mm, k=np.arange(1, count + 1))[1]
+        factor = np.maximum(everywhere, MAD_TO_SIGMA * np.median(self.off_by[near], axis=1))
         scaled = covariance * factor[:, :, np.newaxis] * factor[:, np.newaxis]
         return Estimates(np.concatenate([part.value_mm for part in parts]), scaled)
 
@@ -236,13 +219,6 @@ class KrigedField:
             "error_over_stated": float(np.sqrt(self.structure.error_factor)),
             "potential_share": self.structure.potential_share,
         }
-
-    def _error_factor(self, points_mm: Floats) -> Floats:
-        """Return how large errors (m, 3) are around places over what the equations say."""
-        everywhere = MAD_TO_SIGMA * np.median(self.off_by, axis=0)
-        count = min(AROUND, len(self.samples))
-        near = KDTree(self.samples.points_mm).query(points_mm, k=np.arange(1, count + 1))[1]
-        return np.maximum(everywhere, MAD_TO_SIGMA * np.median(self.off_by[near], axis=1))
 
 
 def is_rough(samples: Samples) -> bool:
@@ -293,39 +269,31 @@ def _without_outliers(
 
     Of each it is the `kept` ones, and in later rounds those of the round before, that let expect something.
     """
-    for _ in range(rounds):
-        off, covariance = _left_out(samples, kept, structure)
-        kept = _belongs(samples, off, covariance)
-    return kept, np.abs(off[kept]) / np.sqrt(np.einsum("nii->ni", covariance[kept]))
-
-
-def _left_out(samples: Samples, kept: NDArray[np.bool_], structure: VectorStructure) -> tuple[Floats, Floats]:
-    """Return what each sample is off the nearest kept others by (n, 3), and the covariances (n, 3, 3) expected."""
-    others = samples.subset(kept)
-    unknown = unknown_variance(others)
-    number = np.where(kept, np.cumsum(kept) - 1, -1)
-    count = min(USED_FOR_OUTLIERS, len(others) - 1)
-    value, covariance = np.empty((len(samples), 3)), np.empty((len(samples), 3, 3))
-    for part, near in _nearest(others.points_mm, samples.points_mm, count + 1):
-        near = without_own(near, number[part])
-        found = estimated(samples.points_mm[part], near, others, structure, unknown)
-        value[part], covariance[part] = found.value_mm, found.covariance_mm2
     own = structure.error_factor * samples.covariance_mm2 + structure.nugget_mm2 * np.eye(3)
-    return samples.value_mm - value, covariance + own
-
-
-def _belongs(samples: Samples, off: Floats, covariance: Floats) -> NDArray[np.bool_]:
-    """Return which samples (n,) belong to the flow rather than being off by the order of their neighbours' distance."""
     spacing = spacing_of(samples.points_mm)
-    of_flow = np.einsum("ni,ni->n", off, np.linalg.solve(covariance, off[..., np.newaxis])[..., 0])
-    times = max(float(np.median(of_flow)) / CHI_SQUARED_MEDIAN, 1.0)
-    wide = covariance * times + spacing**2 * np.eye(3)
-    of_wrong = np.einsum("ni,ni->n", off, np.linalg.solve(wide, off[..., np.newaxis])[..., 0])
-    log_density_ratio = 0.5 * (
-        np.linalg.slogdet(wide)[1] - np.linalg.slogdet(covariance * times)[1] + of_wrong - of_flow / times
-    )
     probability = np.clip(samples.probability, 1.0 - LARGEST_PROBABILITY, LARGEST_PROBABILITY)
-    return np.asarray(log_density_ratio + np.log(probability / (1.0 - probability)) > 0.0)
+    for _ in range(rounds):
+        # What each sample is off the nearest kept others by, and the covariances expected.
+        others = samples.subset(kept)
+        unknown = unknown_variance(others)
+        number = np.where(kept, np.cumsum(kept) - 1, -1)
+        count = min(USED_FOR_OUTLIERS, len(others) - 1)
+        off, covariance = np.empty((len(samples), 3)), np.empty((len(samples), 3, 3))
+        for part, near in _nearest(others.points_mm, samples.points_mm, count + 1):
+            near = without_own(near, number[part])
+            found = estimated(samples.points_mm[part], near, others, structure, unknown)
+            off[part] = samples.value_mm[part] - found.value_mm
+            covariance[part] = found.covariance_mm2 + own[part]
+        # Which belong to the flow rather than being off by the order of their neighbours' distance.
+        of_flow = np.einsum("ni,ni->n", off, np.linalg.solve(covariance, off[..., np.newaxis])[..., 0])
+        times = max(float(np.median(of_flow)) / CHI_SQUARED_MEDIAN, 1.0)
+        wide = covariance * times + spacing**2 * np.eye(3)
+        of_wrong = np.einsum("ni,ni->n", off, np.linalg.solve(wide, off[..., np.newaxis])[..., 0])
+        log_density_ratio = 0.5 * (
+            np.linalg.slogdet(wide)[1] - np.linalg.slogdet(covariance * times)[1] + of_wrong - of_flow / times
+        )
+        kept = log_density_ratio + np.log(probability / (1.0 - probability)) > 0.0
+    return kept, np.abs(off[kept]) / np.sqrt(np.einsum("nii->ni", covariance[kept]))
 
 
 def _nearest(points: Floats, places: Floats, count: int) -> list[tuple[slice, NDArray[np.int64]]]:
@@ -346,33 +314,8 @@ UNRESOLVED_CHI2 = 3.0
 FEW_SAMPLES = 600
 
 
-class Field(Protocol):
-    """A velocity field that is known everywhere in a box, as displacements from one frame to the next."""
-
-    @property
-    def probability(self) -> Floats:
-        """The probability (n,) of each sample to belong to the field."""
-        ...
-
-    def value_at(self, points_mm: Floats) -> Floats:
-        """Return displacements (m, 3), mm."""
-        ...
-
-    def estimate_at(self, points_mm: Floats) -> tuple[Floats, Floats]:
-        """Return displacements and their variances at once."""
-        ...
-
-    def variance_at(self, points_mm: Floats) -> Floats:
-        """Return the variances (m, 3) of the displacements, mm^2."""
-        ...
-
-    def gradient_at(self, points_mm: Floats) -> Floats:
-        """Return the gradients (m, 3, 3) of the displacements per mm: the component, then the direction."""
-        ...
-
-    def told(self) -> dict[str, Any]:
-        """Return how the field was fitted: figures with their units in their names."""
-        ...
+# A velocity field that is known everywhere in a box, as displacements from one frame to the next.
+Field = SplineField | KrigedField
 
 
 def fit_field(

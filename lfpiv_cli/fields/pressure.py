@@ -19,13 +19,12 @@ from typing import ClassVar, Self
 
 import numba
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
 from lfpiv_cli.arrays import Floats
 from lfpiv_cli.fields.evidence import Box, first_expectation, most_probable
 from lfpiv_cli.fields.fit import Field
 from lfpiv_cli.fields.samples import Samples, belonging, error_covariance, squares
-from lfpiv_cli.fields.spline_field import SplineField, gradient_covariance_at
+from lfpiv_cli.fields.spline_field import LAST_CHANGE, POINTS_AT_ONCE, ROUNDS, SplineField, gradient_covariance_at
 from lfpiv_cli.fields.stencils import (
     DEGREE,
     SECOND,
@@ -115,15 +114,8 @@ def _add_rows(matrix, first, rows):  # type: ignore[no-untyped-def]  # numba
 
 
 MM_PER_M = 1000.0
-# Rounds of weighing samples; the last change of their probabilities that matters, on the average.
-ROUNDS, LAST_CHANGE = 4, 0.002
-# Knots so many times wider tell which samples are far off.
-WIDE = 1.6
-POINTS_AT_ONCE = 500
 # Knots are so many times the samples' mean distance apart, as a velocity field's.
 KNOTS_OF_DISTANCE = 1.8
-# A factorisation of so many unknowns takes seconds; knots that are too many are set apart by this factor.
-MOST_UNKNOWNS, COARSER = 3000, 1.05
 # Gradients are not known better than to this share of their spread: the constant that they do not tell would drown.
 LEAST_ERROR = 1e-3
 # Differences over so many mm give second derivatives; fields have none within less.
@@ -154,7 +146,7 @@ class PressureField:
     mean: Floats
     wrong_share: float
     expected: Expectation
-    probability: NDArray[np.float64]
+    probability: Floats
     reduced_chi2: float
 
     def value_at(self, points_mm: Floats) -> Floats:
@@ -236,13 +228,6 @@ def knots_for(points_mm: Floats) -> float:
     return KNOTS_OF_DISTANCE * float(np.prod(size) / max(len(points_mm), 1)) ** (1.0 / 3.0)
 
 
-def lattice_over(low_mm: ArrayLike, high_mm: ArrayLike, knot_mm: float) -> Lattice:
-    """Return the lattice over a box, with knots further apart where they would be too many."""
-    while int(np.prod((lattice := Lattice.over(low_mm, high_mm, knot_mm)).shape)) > MOST_UNKNOWNS:
-        knot_mm *= COARSER
-    return lattice
-
-
 def pressure_field(
     samples: Samples, lattice: Lattice, rng: np.random.Generator, wrong_share: float = 0.0
 ) -> PressureField:
@@ -257,23 +242,37 @@ def pressure_field(
     expected = first_expectation(samples, lattice, (SECOND, THIRD), GradientBox)
     least = (LEAST_ERROR * expected.spread_mm) ** 2 * np.eye(3)
     samples = replace(samples, covariance_mm2=samples.covariance_mm2 + least)
-    probability = _first_beliefs(samples, lattice, expected)
+    # The first probabilities are those to belong to a pressure of wide knots, which no single sample can bend.
+    wide = lattice.wide()
+    unresolved, probability = expected.unresolved_mm, samples.probability
+    for _ in range(ROUNDS):
+        covariance = error_covariance(samples, 1.0, unresolved)
+        *_, error = _fitted(samples, wide, expected, covariance, probability)
+        last, probability = probability, belonging(samples, error, covariance, expected.spread_mm)
+        unresolved = MAD_TO_SIGMA * float(np.median(np.abs(error).max(axis=1)))
+        if np.mean(np.abs(probability - last)) < LAST_CHANGE:
+            break
     expected, _ = most_probable(replace(samples, probability=probability), lattice, expected, rng, GradientBox)
     covariance = error_covariance(samples, expected.scale, expected.unresolved_mm)
     for _ in range(ROUNDS):
-        fit = _fitted(samples, lattice, expected, covariance, probability)
-        last, probability = probability, belonging(samples, fit.error, covariance, expected.spread_mm)
+        factor, weight, coefficients, error = _fitted(samples, lattice, expected, covariance, probability)
+        last, probability = probability, belonging(samples, error, covariance, expected.spread_mm)
         if np.mean(np.abs(probability - last)) < LAST_CHANGE:
             break
-    put_back = fit.taken(fit.error)
-    error = fit.error - gradient_at(samples.points_mm, lattice, put_back)
+    # Each spline's mean over the box; the splines' sum is 1 everywhere.
+    x, y, z = (
+        lattice.integrals(axis, 0, 0).sum(axis=1) / (lattice.cells[axis] * lattice.cell_mm[axis]) for axis in range(3)
+    )
+    # What penalties have taken, by the errors that are left: a fit to these.
+    put_back = _coefficients(factor, lattice, samples.points_mm, weight, error)
+    error = error - gradient_at(samples.points_mm, lattice, put_back)
     chi2 = squares(error, samples.covariance_mm2)
     return PressureField(
         lattice,
-        fit.coefficients + put_back,
-        fit.taken(error),
-        fit.factor,
-        _means(lattice),
+        coefficients + put_back,
+        _coefficients(factor, lattice, samples.points_mm, weight, error),
+        factor,
+        (x[:, None, None] * y[:, None] * z).ravel(),
         wrong_share,
         expected,
         probability,
@@ -281,55 +280,21 @@ def pressure_field(
     )
 
 
-@dataclass(frozen=True, eq=False)
-class _Fit:
-    """A fit and what it was made of: weights (n, 3, 3), coefficients (nx, ny, nz) and errors (n, 3) of the samples."""
-
-    samples: Samples
-    lattice: Lattice
-    weight: Floats
-    factor: Factor
-    coefficients: Floats
-    error: Floats
-
-    def taken(self, error: Floats) -> Floats:
-        """Return the coefficients of what penalties have taken, by the errors that are left: a fit to these."""
-        return _coefficients(self.factor, self.lattice, self.samples.points_mm, self.weight, error)
-
-
 def _coefficients(factor: Factor, lattice: Lattice, points_mm: Floats, weight: Floats, gradient: Floats) -> Floats:
     right = right_hand_side(lattice, points_mm, np.einsum("nij,nj->ni", weight, gradient))
     return factor.solve(right).reshape(lattice.shape)
 
 
-def _fitted(samples: Samples, lattice: Lattice, expected: Expectation, covariance: Floats, probability: Floats) -> _Fit:
-    """Return the pressure of the least sum of squares and penalties."""
+def _fitted(
+    samples: Samples, lattice: Lattice, expected: Expectation, covariance: Floats, probability: Floats
+) -> tuple[Factor, Floats, Floats, Floats]:
+    """Return the pressure of the least sum of squares and penalties.
+
+    Factor, weights (n, 3, 3) of the samples, coefficients (nx, ny, nz) and errors (n, 3) of the samples.
+    """
     matrix = expected_inverse(lattice, replace(expected, spread_mm=lattice.smallest_mm * expected.spread_mm), 1)
     weight = probability[:, np.newaxis, np.newaxis] * np.linalg.inv(covariance)
     add_gradients(matrix, lattice, samples.points_mm, weight)
     factor = factorised(matrix)
     found = _coefficients(factor, lattice, samples.points_mm, weight, samples.value_mm)
-    error = samples.value_mm - gradient_at(samples.points_mm, lattice, found)
-    return _Fit(samples, lattice, weight, factor, found, error)
-
-
-def _first_beliefs(samples: Samples, lattice: Lattice, expected: Expectation) -> Floats:
-    """Return the probability of each sample to belong to a pressure of wide knots, which no single one can bend."""
-    wide = Lattice.over(lattice.low_mm, lattice.high_mm, WIDE * max(lattice.cell_mm))
-    unresolved, probability = expected.unresolved_mm, samples.probability
-    for _ in range(ROUNDS):
-        covariance = error_covariance(samples, 1.0, unresolved)
-        error = _fitted(samples, wide, expected, covariance, probability).error
-        last, probability = probability, belonging(samples, error, covariance, expected.spread_mm)
-        unresolved = MAD_TO_SIGMA * float(np.median(np.abs(error).max(axis=1)))
-        if np.mean(np.abs(probability - last)) < LAST_CHANGE:
-            break
-    return probability
-
-
-def _means(lattice: Lattice) -> Floats:
-    """Return each spline's mean over the box; the splines' sum is 1 everywhere."""
-    x, y, z = (
-        lattice.integrals(axis, 0, 0).sum(axis=1) / (lattice.cells[axis] * lattice.cell_mm[axis]) for axis in range(3)
-    )
-    return np.asarray((x[:, None, None] * y[:, None] * z).ravel())
+    return factor, weight, found, samples.value_mm - gradient_at(samples.points_mm, lattice, found)

@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lfpiv_cli.arrays import Floats
 from lfpiv_cli.fields import stencils
@@ -35,15 +34,9 @@ from lfpiv_cli.fields.stencils import (
 # Knots are so many times the samples' mean distance apart: a third as many knots as samples. Among factors of 1.2 to
 # 1.8, less adds noise where samples are few, and more holds divergence and values of small vortices further off.
 KNOTS_OF_DISTANCE = 1.4
-# A factorisation of so many unknowns, and what is needed of its inverse, takes seconds and 600 MB.
-MOST_UNKNOWNS = 9000
-# Knots that are too many are set apart by this factor until they are not.
-COARSER = 1.05
 # Rounds of weighing samples; the last change of their probabilities that matters, on the average.
 ROUNDS, LAST_CHANGE = 4, 0.002
 POINTS_AT_ONCE = 500
-# Knots so many times wider tell how the flow changes around each sample.
-WIDE = 1.6
 # So many samples for each unknown tell such a field.
 ENOUGH_OF_UNKNOWNS = 1
 # Walls hold the field to 0 within this share of the samples' spread at each of their points.
@@ -112,47 +105,28 @@ class SplineField:
         plane = int(np.prod(self.lattice.shape[1:]))
         planes, within = columns // plane, columns % plane
         diagonal, below = self.covariance
-        length = len(diagonal[0]) // (3 * plane)
+        length, each = len(diagonal[0]) // (3 * plane), columns.shape[1] // 4
         found = np.zeros(points_mm.shape)
-        for first in np.unique(planes[:, 0]):
+        for first in np.unique(planes[:, 0]).tolist():
+            # Points whose splines begin in one plane of x.
             which = np.flatnonzero(planes[:, 0] == first)
-            found[which] = self._in_planes(int(first), length, within[which], values[which], diagonal, below)
-        return found
-
-    def _in_planes(
-        self,
-        first: int,
-        length: int,
-        within: NDArray[np.int64],
-        values: Floats,
-        diagonal: list[Block],
-        below: list[Block],
-    ) -> Floats:
-        """Return variances at points whose splines begin in one plane of x."""
-        plane = int(np.prod(self.lattice.shape[1:]))
-        each = within.shape[1] // 4
-        found = np.zeros((len(within), 3))
-        for one in range(4):
-            for other in range(one + 1):
-                rows, columns = first + one, first + other
-                block = diagonal[rows // length] if rows // length == columns // length else below[columns // length]
+            for one, other in zip(*np.tril_indices(4), strict=True):
+                up, low = first + one, first + other
+                block = diagonal[up // length] if up // length == low // length else below[low // length]
                 left, right = slice(one * each, (one + 1) * each), slice(other * each, (other + 1) * each)
                 for axis in range(3):
-                    row = (rows % length * 3 + axis) * plane + within[:, left]
-                    column = (columns % length * 3 + axis) * plane + within[:, right]
+                    row = (up % length * 3 + axis) * plane + within[which, left]
+                    column = (low % length * 3 + axis) * plane + within[which, right]
                     part = block[row[:, :, np.newaxis], column[:, np.newaxis]]
-                    term = np.einsum("ni,nij,nj->n", values[:, left], part, values[:, right])
-                    found[:, axis] += term if one == other else 2.0 * term
+                    term = np.einsum("ni,nij,nj->n", values[which, left], part, values[which, right])
+                    found[which, axis] += term if one == other else 2.0 * term
         return found
 
 
 def lattice_for(samples: int, low_mm: Floats, high_mm: Floats) -> Lattice:
     """Return the knots for so many samples in a box."""
     distance = float(np.prod(np.subtract(high_mm, low_mm)) / max(samples, 1)) ** (1.0 / 3.0)
-    knot = KNOTS_OF_DISTANCE * distance
-    while (lattice := Lattice.over(low_mm, high_mm, knot)).unknowns > MOST_UNKNOWNS:
-        knot *= COARSER
-    return lattice
+    return Lattice.affordable(low_mm, high_mm, KNOTS_OF_DISTANCE * distance)
 
 
 def spline_field(
@@ -172,11 +146,27 @@ def spline_field(
     about = replace(samples, value_mm=samples.value_mm - mean)
     penalties = (SECOND, THIRD) if divergence == "off" else (SECOND, THIRD, DIVERGENCE)
     expected = first_expectation(about, lattice, penalties)
-    about = with_places(about, _first_gradients(about, lattice, still_mm, expected, rng))
+    # The gradients of a field of wide knots tell what errors of places add.
+    wide = lattice.wide()
+    few = np.sort(rng.choice(len(about), min(len(about), ENOUGH_OF_UNKNOWNS * wide.unknowns), replace=False))
+    part = about.subset(few)
+    covariance = error_covariance(part, 1.0, expected.unresolved_mm)
+    _, coefficients = _solved(part, wide, _before(wide, expected, still_mm), covariance, part.probability)
+    gradient = [_field_at(about.points_mm, wide, coefficients, axis) for axis in range(3)]
+    about = with_places(about, np.stack(gradient, axis=2))
+    # With `by_others`, the covariance of the field at a sample that takes no part, one left out may return.
     expected, by_others = most_probable(about, lattice, expected, rng)
     if divergence == "free":
-        expected = _without_divergence(expected, lattice)
-    factor, coefficients, probability, error = _weighed(about, lattice, still_mm, expected, by_others)
+        weights = {**expected.weights, DIVERGENCE: divergence_weight(expected, lattice, FREE_DIVERGENCE)}
+        expected = replace(expected, weights=weights)
+    before, probability = _before(lattice, expected, still_mm), about.probability
+    covariance = error_covariance(about, expected.scale, expected.unresolved_mm)
+    for _ in range(ROUNDS):
+        factor, coefficients = _solved(about, lattice, before, covariance, probability)
+        error = about.value_mm - _field_at(about.points_mm, lattice, coefficients)
+        last, probability = probability, belonging(about, error, covariance + by_others, expected.spread_mm)
+        if np.mean(np.abs(probability - last)) < LAST_CHANGE:
+            break
     chi2 = squares(error, about.covariance_mm2)
     return SplineField(
         lattice,
@@ -187,36 +177,6 @@ def spline_field(
         probability,
         float(np.sum(probability * chi2) / (3.0 * np.sum(probability))),
     )
-
-
-def _first_gradients(
-    samples: Samples, lattice: Lattice, still_mm: Floats, expected: Expectation, rng: np.random.Generator
-) -> Floats:
-    """Return the gradients (n, 3, 3) of a field of wide knots at the samples."""
-    wide = Lattice.over(lattice.low_mm, lattice.high_mm, WIDE * max(lattice.cell_mm))
-    few = np.sort(rng.choice(len(samples), min(len(samples), ENOUGH_OF_UNKNOWNS * wide.unknowns), replace=False))
-    part = samples.subset(few)
-    covariance = error_covariance(part, 1.0, expected.unresolved_mm)
-    _, coefficients = _solved(part, wide, _before(wide, expected, still_mm), covariance, part.probability)
-    return np.stack([_field_at(samples.points_mm, wide, coefficients, axis) for axis in range(3)], axis=2)
-
-
-def _weighed(
-    samples: Samples, lattice: Lattice, still_mm: Floats, expected: Expectation, by_others: Floats
-) -> tuple[Factor, Floats, Floats, Floats]:
-    """Fit, and weigh samples anew; return factor, coefficients, probabilities and errors (n, 3).
-
-    `by_others` (3, 3) is the covariance of the field at a sample that takes no part, so that one left out may return.
-    """
-    before, probability = _before(lattice, expected, still_mm), samples.probability
-    covariance = error_covariance(samples, expected.scale, expected.unresolved_mm)
-    for _ in range(ROUNDS):
-        factor, coefficients = _solved(samples, lattice, before, covariance, probability)
-        error = samples.value_mm - _field_at(samples.points_mm, lattice, coefficients)
-        last, probability = probability, belonging(samples, error, covariance + by_others, expected.spread_mm)
-        if np.mean(np.abs(probability - last)) < LAST_CHANGE:
-            break
-    return factor, coefficients, probability, error
 
 
 def _solved(
@@ -248,12 +208,6 @@ def _before(lattice: Lattice, expected: Expectation, still_mm: Floats) -> Stenci
     return before
 
 
-def _without_divergence(expected: Expectation, lattice: Lattice) -> Expectation:
-    """Return the expectation of a field that has next to none."""
-    weights = {**expected.weights, DIVERGENCE: divergence_weight(expected, lattice, FREE_DIVERGENCE)}
-    return replace(expected, weights=weights)
-
-
 # The covariances of a spline field's gradients, from the blocks of its coefficients' covariance.
 #
 # Axes: a gradient's elements (component, direction) in C order.
@@ -264,11 +218,20 @@ COMPONENTS = 3
 def gradient_covariance_at(field: SplineField, points_mm: Floats) -> Floats:
     """Return the covariances (m, 9, 9) of a field's gradients at points, per mm^2 of squared displacements."""
     columns, slopes = gradient_rows(field.lattice, points_mm)
-    plane = int(np.prod(field.lattice.shape[1:]))
+    diagonal, below = field.covariance
+    plane, length = int(np.prod(field.lattice.shape[1:])), len(diagonal[0])
     found = np.empty((len(points_mm), COMPONENTS, 3, COMPONENTS, 3))
     firsts = columns[:, 0] // plane
     for first in np.unique(firsts):
-        whole = _of_planes(field, int(first), plane)
+        # The covariance of the coefficients of four planes of x, which lie in one block or in two.
+        start, size = int(first) * COMPONENTS * plane, SUPPORT * COMPONENTS * plane
+        block = start // length
+        if start + size <= block * length + len(diagonal[block]):
+            whole = diagonal[block]
+        else:
+            whole = np.block([[diagonal[block], below[block].T], [below[block], diagonal[block + 1]]])
+        inside = slice(start - block * length, start - block * length + size)
+        whole = whole[inside, inside]
         here = np.flatnonzero(firsts == first)
         cells, which = np.unique(columns[here], axis=0, return_inverse=True)
         for number, cell in enumerate(cells):
@@ -278,17 +241,3 @@ def gradient_covariance_at(field: SplineField, points_mm: Floats) -> Floats:
             of_cell = whole[rows[:, :, np.newaxis, np.newaxis], rows]
             found[at] = np.einsum("mdk,ckbl,mel->mcdbe", slopes[at], of_cell, slopes[at], optimize=True)
     return found.reshape(len(points_mm), COMPONENTS * 3, COMPONENTS * 3)
-
-
-def _of_planes(field: SplineField, first: int, plane: int) -> Floats:
-    """Return the covariance of the coefficients of four planes of x, which lie in one block or in two."""
-    diagonal, below = field.covariance
-    length = len(diagonal[0])
-    start, size = first * COMPONENTS * plane, SUPPORT * COMPONENTS * plane
-    block = start // length
-    if start + size <= block * length + len(diagonal[block]):
-        whole = diagonal[block]
-    else:
-        whole = np.block([[diagonal[block], below[block].T], [below[block], diagonal[block + 1]]])
-    inside = slice(start - block * length, start - block * length + size)
-    return whole[inside, inside]

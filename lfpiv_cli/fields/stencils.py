@@ -36,6 +36,10 @@ NEIGHBOURS = 2 * DEGREE + 1
 GAUSS_POINTS = 4
 # A box that is a whole number of cells long but for rounding has this number.
 ROUNDING = 1e-9
+# A factorisation of three components of so many splines, and what is needed of its inverse, takes seconds and 600 MB.
+MOST_SPLINES = 3000
+# Knots that are too many are set apart by this factor until they are not; those that a first field has, by this one.
+COARSER, WIDE = 1.05, 1.6
 
 
 @dataclass(frozen=True)
@@ -64,6 +68,17 @@ class Lattice:
         nx, ny, nz = cells.tolist()
         return cls((x, y, z), (dx, dy, dz), (nx, ny, nz))
 
+    @classmethod
+    def affordable(cls, low_mm: ArrayLike, high_mm: ArrayLike, knot_mm: float) -> Lattice:
+        """Return the lattice over a box, with knots further apart where splines would be too many."""
+        while int(np.prod((lattice := cls.over(low_mm, high_mm, knot_mm)).shape)) > MOST_SPLINES:
+            knot_mm *= COARSER
+        return lattice
+
+    def wide(self) -> Lattice:
+        """Return one over the same box whose knots are further apart: no single sample bends a field of such knots."""
+        return Lattice.over(self.low_mm, self.high_mm, WIDE * max(self.cell_mm))
+
     @property
     def high_mm(self) -> Floats:
         """The box' corner with the largest x, y, z."""
@@ -81,11 +96,6 @@ class Lattice:
         return 3 * int(np.prod(self.shape))
 
     @property
-    def volume_mm3(self) -> float:
-        """The box' volume."""
-        return float(np.prod(np.multiply(self.cells, self.cell_mm)))
-
-    @property
     def smallest_mm(self) -> float:
         """The box' smallest length."""
         return float(np.min(np.multiply(self.cells, self.cell_mm)))
@@ -97,12 +107,17 @@ class Lattice:
         """
         place = (points_mm - np.asarray(self.low_mm)) / np.asarray(self.cell_mm)
         first = np.clip(np.floor(place).astype(np.int64), 0, np.asarray(self.cells) - 1)
-        inside = place - first
-        values = [
-            _slopes(inside[:, axis]) / self.cell_mm[axis] if axis == along else _values(inside[:, axis])
-            for axis in range(3)
-        ]
-        return first, values
+        found = []
+        for axis, u in enumerate((place - first).T):
+            # At places u of a unit cell.
+            rest = 1.0 - u
+            if axis == along:
+                slopes = [-(rest**2), 3.0 * u**2 - 4.0 * u, -3.0 * rest**2 + 4.0 * rest, u**2]
+                found.append(0.5 * np.stack(slopes, axis=1) / self.cell_mm[axis])
+            else:
+                values = [rest**3, 3.0 * u**3 - 6.0 * u**2 + 4.0, 3.0 * rest**3 - 6.0 * rest**2 + 4.0, u**3]
+                found.append(np.stack(values, axis=1) / 6.0)
+        return first, found
 
     def integrals(self, axis: int, first: int, second: int) -> Floats:
         """Return the integrals (n, 7) of derivatives of splines i and i + k - 3 along an axis over the box, 0 beyond.
@@ -122,20 +137,6 @@ class Lattice:
             rows = np.arange(max(0, -shift), min(count, count - shift))
             banded[rows, k] = product[rows, rows + shift]
         return banded
-
-
-def _values(u: Floats) -> Floats:
-    """Return the four splines (n, 4) at places u of a unit cell."""
-    rest = 1.0 - u
-    terms = [rest**3, 3.0 * u**3 - 6.0 * u**2 + 4.0, 3.0 * rest**3 - 6.0 * rest**2 + 4.0, u**3]
-    return np.stack(terms, axis=1) / 6.0
-
-
-def _slopes(u: Floats) -> Floats:
-    """Return the derivatives of the four splines (n, 4) at places u of a unit cell."""
-    rest = 1.0 - u
-    terms = [-(rest**2), 3.0 * u**2 - 4.0 * u, -3.0 * rest**2 + 4.0 * rest, u**2]
-    return 0.5 * np.stack(terms, axis=1)
 
 
 Stencil = Floats
@@ -320,7 +321,7 @@ def penalty(lattice: Lattice, name: str, components: int = 3) -> Stencil:
 def bound(lattice: Lattice, spread_mm: float, components: int = 3) -> Stencil:
     """Return what keeps fields bounded that no other penalty sees."""
     matrix = empty(lattice, components)
-    factor = 1.0 / ((SPREADS * spread_mm) ** 2 * lattice.volume_mm3)
+    factor = 1.0 / ((SPREADS * spread_mm) ** 2 * float(np.prod(np.multiply(lattice.cells, lattice.cell_mm))))
     add_scalar(matrix, factor, smoothness(lattice, 0))
     return matrix
 
@@ -329,17 +330,8 @@ def expected_inverse(lattice: Lattice, expected: Expectation, components: int = 
     """Return the inverse covariance of a field before any sample."""
     matrix = bound(lattice, expected.spread_mm, components)
     for name, weight in expected.weights.items():
-        if name == DIVERGENCE:
-            matrix += weight * divergence(lattice)
-        else:
-            add_scalar(matrix, weight, smoothness(lattice, ORDERS[name]))
+        matrix += weight * penalty(lattice, name, components)
     return matrix
-
-
-def spread_of(values: np.ndarray) -> float:
-    """Return by how much values (n, c) differ, 1.48 times the median distance from their median."""
-    off = np.abs(values - np.median(values, axis=0))
-    return max(float(1.4826 * np.median(off.max(axis=1))), np.finfo(np.float64).tiny)
 
 
 # Cholesky's factorisation of block tridiagonal matrices, and those blocks of the inverse that variances need.

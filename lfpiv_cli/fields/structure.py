@@ -15,7 +15,7 @@ Axes: offsets (..., 3) in mm, displacements in mm.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -69,10 +69,6 @@ class VectorStructure:
         )
         slope, kappa = over * share, self.potential_share
         return slope + (1.0 - kappa) * (slope + square * curved), (3.0 * kappa - 1.0) * curved
-
-    def scaled(self, times: float) -> VectorStructure:
-        """Return the one of a flow whose mean squares are so many times as large."""
-        return replace(self, factor=float(self.factor * times))
 
     def steepness(self, distance_mm: float) -> float:
         """Return the power of the distance with which g grows at one."""
@@ -160,22 +156,6 @@ def between(points: Floats, errors: Floats, structure: VectorStructure, unknown:
     return matrix.reshape(places, 3 * count, 3 * count)
 
 
-def towards(at: Floats, points: Floats, structure: VectorStructure, unknown: float) -> tuple[Floats, Floats]:
-    """Return the covariances (b, 3k, 3) of samples at points (b, k, 3) with what is at places (b, 3), and of that."""
-    middle = points.mean(axis=1, keepdims=True)
-    own = _halves(at[:, np.newaxis] - middle, structure)
-    aim = _halves(points - middle, structure) - _halves(points - at[:, np.newaxis], structure) + own
-    aim += unknown * np.eye(3)[:, np.newaxis]
-    return aim.reshape(len(at), -1, 3), 2.0 * own[:, :, 0] + unknown * np.eye(3)
-
-
-def towards_slopes(at: Floats, points: Floats, structure: VectorStructure) -> Floats:
-    """Return the derivatives (b, 3k, 3, 3) of `towards`, last axis the direction into which the place moves."""
-    place = at[:, np.newaxis]
-    slopes = _half_slopes(place - points.mean(axis=1, keepdims=True), structure)
-    return (slopes - _half_slopes(place - points, structure)).reshape(len(at), -1, 3, 3)
-
-
 def _halves(offset: Floats, structure: VectorStructure) -> Floats:
     """Return half the structure function (b, 3, k, 3) at offsets (b, k, 3)."""
     level, along = structure.parts(np.einsum("bki,bki->bk", offset, offset))
@@ -231,14 +211,17 @@ def estimated(
 ) -> Estimates:
     """Return the estimates at places (b, 3) from the samples `near` (b, k)."""
     points, values = samples.points_mm[near], samples.value_mm[near]
-    middle = values.mean(axis=1)
+    middle, usual = points.mean(axis=1, keepdims=True), values.mean(axis=1)
     matrices = between(points, samples.covariance_mm2[near], structure, unknown)
-    aim, own = towards(at, points, structure, unknown)
+    # The covariances (b, 3k, 3) of the samples with what is at the places, and of that.
+    own = _halves(at[:, np.newaxis] - middle, structure)
+    aim = _halves(points - middle, structure) - _halves(points - at[:, np.newaxis], structure) + own
+    aim += unknown * np.eye(3)[:, np.newaxis]
+    aim = aim.reshape(len(at), -1, 3)
     weights = weights_of(matrices, aim)
-    about = (values - middle[:, np.newaxis]).swapaxes(1, 2).reshape(len(at), 1, -1)
-    value = middle + (about @ weights)[:, 0]
-    missed = own - aim.swapaxes(1, 2) @ weights
-    return Estimates(value, 0.5 * (missed + missed.swapaxes(1, 2)))
+    about = (values - usual[:, np.newaxis]).swapaxes(1, 2).reshape(len(at), 1, -1)
+    missed = 2.0 * own[:, :, 0] + unknown * np.eye(3) - aim.swapaxes(1, 2) @ weights
+    return Estimates(usual + (about @ weights)[:, 0], 0.5 * (missed + missed.swapaxes(1, 2)))
 
 
 def estimated_slopes(
@@ -248,5 +231,9 @@ def estimated_slopes(
     points, values = samples.points_mm[near], samples.value_mm[near]
     about = (values - values.mean(axis=1, keepdims=True)).swapaxes(1, 2).reshape(len(at), -1, 1)
     potentials = weights_of(between(points, samples.covariance_mm2[near], structure, unknown), about)
-    slopes = towards_slopes(at, points, structure)
-    return np.asarray(np.einsum("bn,bnjl->bjl", potentials[..., 0], slopes))
+    # Those of the covariances with the samples, last axis the direction into which the place moves.
+    place = at[:, np.newaxis]
+    slopes = _half_slopes(place - points.mean(axis=1, keepdims=True), structure) - _half_slopes(
+        place - points, structure
+    )
+    return np.asarray(np.einsum("bn,bnjl->bjl", potentials[..., 0], slopes.reshape(len(at), -1, 3, 3)))

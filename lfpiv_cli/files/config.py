@@ -38,8 +38,7 @@ from lfpiv_cli.files.sections_simulated import (
     flow_of,
 )
 from lfpiv_cli.files.yaml_nodes import Document, read_rig
-from lfpiv_cli.flow.correlation import CorrelationSettings
-from lfpiv_cli.flow.windows import ParallelWalls, Walls
+from lfpiv_cli.flow.windows import CorrelationSettings, ParallelWalls, Walls
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.names import Refraction
 from lfpiv_cli.optics.camera import Camera
@@ -350,9 +349,11 @@ class Config:
 
     def correlation_settings(self, voxel_mm: Lengths) -> CorrelationSettings:
         """Return how volumes of such voxels are correlated: by a configured power, or the solver's default."""
-        chosen, solver = self.correlation, SOLVERS.get(self.reconstruction.solver)
-        exponent = chosen.exponent or (solver.exponent if solver else 1.0)
-        return CorrelationSettings(self.windows_voxel(voxel_mm), self.overlap(voxel_mm), chosen.dt_s, exponent)
+        solver = SOLVERS.get(self.reconstruction.solver)
+        chosen = {field.name: getattr(self.correlation, field.name) for field in fields(CorrelationSettings)}
+        chosen["exponent"] = self.correlation.exponent or (solver.exponent if solver else 1.0)
+        chosen |= {"windows": self.windows_voxel(voxel_mm), "overlap": self.overlap(voxel_mm)}
+        return CorrelationSettings(**chosen)
 
     def simulated_flow(self, reference: Reference = FOCAL_POINT) -> Flow:
         """Return the flow to render, a function of points: z as in the config, or from the focal point as in `grid`."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Annotated, Literal
 
 from pydantic import Field
@@ -44,6 +46,7 @@ from lfpiv_cli.names import (
     Refraction,
     Sampling,
     Start,
+    Weighting,
 )
 from lfpiv_cli.optics.line_responses import USUAL_DIFFUSION_PX
 from lfpiv_cli.optics.waves import Waves
@@ -127,6 +130,7 @@ class CorrelationSection(Section):
     what lies outside the section pipe.
     exponent: power of the intensities that is correlated (default: 0.5 for volumes of the solvers em, smart and mart;
     their brightest particles outweigh all others; and 1 for sart's).
+    weighting: uniform counts all voxels of a window alike, gaussian those near its middle more.
     """
 
     windows: Windows | None = None
@@ -135,6 +139,17 @@ class CorrelationSection(Section):
     dt_s: Positive | None = None
     mask: Mask | None = None
     exponent: Annotated[float, Field(gt=0.0, le=1.0)] | None = None
+    weighting: Weighting = "uniform"
+
+
+@dataclass(frozen=True, kw_only=True)
+class CorrelationKeys:
+    """Keys of the section `correlation` that options take the place of; None leaves a key as it is."""
+
+    dt_s: float | None = None
+    windows: Sequence[int | Sequence[int]] | None = None
+    overlap: float | Sequence[float] | None = None
+    weighting: Weighting | None = None
 
 
 class SquareDuct(Section):

@@ -74,10 +74,22 @@ def combine(first: VectorField, second: VectorField) -> Combined:
     InputError
         The fields differ in grid, voxels or time.
     """
-    _ensure_alike(first, second)
+    fields = first, second
+    lengths = [np.array([field.grid.spacing_mm, field.grid.origin_mm, field.voxel_mm]) for field in fields]
+    alike = (first.grid.shape_xyz, first.dt_s) == (second.grid.shape_xyz, second.dt_s)
+    if not alike or np.abs(lengths[0] - lengths[1]).max() > SAME_PLACE_VOXEL * min(first.voxel_mm):
+        told = [f"{field.grid}, voxels of {field.voxel_mm} mm, {field.dt_s} s" for field in fields]
+        raise InputError(f"the two vector fields differ in grid, voxels or time: {told[0]} and {told[1]}")
     masked = (first.flag == MASKED) | (second.flag == MASKED)
-    ranks = np.stack([_rank(field) for field in (first, second)])
-    values, stated = (np.stack(pair) for pair in zip(_vectors(first), _vectors(second), strict=True))
+    values = np.stack([field.displacement_voxel for field in fields])
+    stated, ranks = np.full(values.shape, np.nan), np.full((2, *masked.shape), NONE)
+    for field, sigma, rank in zip(fields, stated, ranks, strict=True):
+        rank[field.flag == REPLACED] = FILLED
+        measured = (field.flag == VALID) | (field.flag == SECOND_PEAK)
+        rank[measured] = UNWEIGHED
+        if field.uncertainty_voxel is not None:
+            sigma[:] = field.uncertainty_voxel
+            rank[measured & np.all(sigma > 0.0, axis=-1)] = WEIGHED
     _estimate_unstated(values, stated, np.where(masked, NONE, ranks))
     ranks[np.isfinite(stated).all(axis=-1) & (ranks == UNWEIGHED)] = WEIGHED
     used = (ranks == ranks.max(axis=0)) & (ranks > NONE) & ~masked
@@ -96,6 +108,9 @@ def combine(first: VectorField, second: VectorField) -> Combined:
     displacement, share = _mean(values, sigma, used)
     flag = np.where(used[0], first.flag, np.where(used[1], second.flag, REJECTED))
     flag = np.where(used.all(axis=0), VALID, np.where(masked, MASKED, flag))
+    # The uncertainty of the mean of what is used: that of one, or that of independent errors of both.
+    known = used[..., np.newaxis] & (sigma > 0.0)
+    total = np.where(known, np.where(known, sigma, 1.0) ** -2.0, 0.0).sum(axis=0)
     field = replace(
         first,
         displacement_voxel=displacement,
@@ -104,40 +119,9 @@ def combine(first: VectorField, second: VectorField) -> Combined:
         peak_ratio=_of_one(first.peak_ratio, second.peak_ratio, used),
         valid_fraction=np.maximum(np.where(used[0], first.valid_fraction, 0.0), used[1] * second.valid_fraction),
         flag=flag.astype(np.uint8),
-        uncertainty_voxel=_uncertainty(sigma, used),
+        uncertainty_voxel=np.asarray(np.where(total > 0.0, total, np.nan) ** -0.5),
     )
     return Combined(field, share, disagreement, left_out, widened)
-
-
-def _ensure_alike(first: VectorField, second: VectorField) -> None:
-    """Refuse fields whose vectors are not of the same places and times."""
-    exact, lengths = zip(
-        *(
-            ((f.grid.shape_xyz, f.dt_s), np.array([f.grid.spacing_mm, f.grid.origin_mm, f.voxel_mm]))
-            for f in (first, second)
-        ),
-        strict=True,
-    )
-    if exact[0] != exact[1] or np.abs(lengths[0] - lengths[1]).max() > SAME_PLACE_VOXEL * min(first.voxel_mm):
-        told = [f"{field.grid}, voxels of {field.voxel_mm} mm, {field.dt_s} s" for field in (first, second)]
-        raise InputError(f"the two vector fields differ in grid, voxels or time: {told[0]} and {told[1]}")
-
-
-def _rank(field: VectorField) -> NDArray[np.int64]:
-    """Return how far each vector (nz, ny, nx) can be relied on."""
-    rank = np.full(field.flag.shape, NONE)
-    rank[field.flag == REPLACED] = FILLED
-    measured = (field.flag == VALID) | (field.flag == SECOND_PEAK)
-    rank[measured] = UNWEIGHED
-    if field.uncertainty_voxel is not None:
-        rank[measured & np.all(field.uncertainty_voxel > 0.0, axis=-1)] = WEIGHED
-    return rank
-
-
-def _vectors(field: VectorField) -> tuple[Floats, Floats]:
-    """Return the displacements and their stated uncertainties, NaN where there are none."""
-    known = field.uncertainty_voxel
-    return field.displacement_voxel, np.full(field.displacement_voxel.shape, np.nan) if known is None else known
 
 
 def _estimate_unstated(values: Floats, stated: Floats, ranks: NDArray[np.int64]) -> None:
@@ -183,13 +167,6 @@ def _mean(values: Floats, sigma: Floats, used: NDArray[np.bool_]) -> tuple[Float
     parts = np.where(used[..., np.newaxis], values, 0.0) * np.stack([share, 1.0 - share])
     some = np.any(used, axis=0, keepdims=True)[0][..., np.newaxis]
     return np.where(some, parts.sum(axis=0), np.nan), np.where(some, share, np.nan)
-
-
-def _uncertainty(sigma: Floats, used: NDArray[np.bool_]) -> Floats:
-    """Return the uncertainty of the mean of what is used: that of one, or that of independent errors of both."""
-    known = used[..., np.newaxis] & (sigma > 0.0)
-    total = np.where(known, np.where(known, sigma, 1.0) ** -2.0, 0.0).sum(axis=0)
-    return np.asarray(np.where(total > 0.0, total, np.nan) ** -0.5)
 
 
 def _second_fits_better(

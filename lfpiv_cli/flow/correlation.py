@@ -12,37 +12,26 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache, reduce
+from functools import reduce
 from operator import add
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
-from threadpoolctl import ThreadpoolController
+from threadpoolctl import threadpool_limits
 
 from lfpiv_cli.arrays import Floats
 from lfpiv_cli.errors import ConfigError, InputError
-from lfpiv_cli.flow.deformation import (
-    Spline,
-    deform_pair,
-    matrices_to_voxels,
-    spline_coefficients,
-    spline_matrix,
-)
+from lfpiv_cli.flow.deformation import Spline, deform_pair, matrices_to_voxels, spline_coefficients, spline_matrix
 from lfpiv_cli.flow.field import VectorField
-from lfpiv_cli.flow.maps import MapSums, map_sums, margins, valid_shares
-from lfpiv_cli.flow.moments import cells_of, gauss_newton, pair_moments
+from lfpiv_cli.flow.moments import gauss_newton
 from lfpiv_cli.flow.outliers import expected_noise, fill_field, mixing, smooth_field, unresolved, validate_vectors
 from lfpiv_cli.flow.peaks import ELONGATED_WIDTH, Peaks, absolute, find_peaks, typical_width, undiluted
-from lfpiv_cli.flow.windows import Triple, WindowLayout, layout_windows
+from lfpiv_cli.flow.sums import MapSums, cells_of, map_sums, margins, pair_moments, valid_shares
+from lfpiv_cli.flow.windows import CorrelationSettings, Triple, WindowLayout, triple
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.simd.block_sums import MOMENTS
 from lfpiv_cli.threads import share_out
-
-# The coarse pass: correlation of binned volumes, which finds displacements up to a quarter of its windows.
-#
-# Axes: volumes `[z, y, x]`, triples and vectors (x, y, z) unless a name says otherwise.
-
 
 # The coarse pass: windows twice the final ones at least (and those that come first), binned to about 16 cells, with
 # shifts of up to 4 cells. That is a quarter of the window, beyond which too few particles are in both volumes.
@@ -58,73 +47,51 @@ def coarse_size(windows: Sequence[Triple]) -> Triple:
 
 
 @dataclass(frozen=True)
-class CoarseLayout:
+class Coarse:
     """The windows of the coarse pass, in cells of `bins` voxels along (x, y, z)."""
 
-    binned: WindowLayout
+    layout: WindowLayout
     bins: Triple
     cells_zyx: Triple
 
-    @property
-    def in_voxels(self) -> WindowLayout:
-        """The same windows in voxels."""
+    @classmethod
+    def over(cls, shape_xyz: Triple, settings: CorrelationSettings) -> Coarse:
+        """Return the windows that fill a volume of so many voxels."""
+        size = coarse_size(settings.windows)
+        bins = triple(max(1, round(w / COARSE_CELLS)) for w in size)
+        cells = triple(-(-n // width) for n, width in zip(shape_xyz, bins, strict=True))
+        binned_size = triple(max(2, round(w / width)) for w, width in zip(size, bins, strict=True))
+        return cls(settings.layout(cells, binned_size), bins, cells[::-1])
 
-        def scaled(triple: Triple) -> Triple:
-            return _triple(tuple(n * width for n, width in zip(triple, self.bins, strict=True)))
+    def sums(self, volumes: Iterable[NDArray[np.float32]]) -> MapSums:
+        """Return what the correlation of two volumes is made of after binning."""
+        before, after = margins(self.layout, self.cells_zyx, COARSE_RADIUS)
+        inside = tuple(slice(m, m + n) for m, n in zip(before, self.cells_zyx, strict=True))
+        binned = []
+        for volume in volumes:
+            # Scaled to a largest magnitude of 1, with margins of zeros; the last bins may be cut.
+            sums = np.zeros(np.add(np.add(before, self.cells_zyx), after), dtype=np.float32)
+            share_out(sum_bins, self.cells_zyx[0], volume, self.bins[::-1], sums[inside])
+            largest = float(max(np.max(sums), -np.min(sums)))
+            if largest > 0.0:
+                sums *= np.float32(1.0 / largest)
+            binned.append(sums)
+        return map_sums(binned[0], binned[1], self.layout, before, COARSE_RADIUS)
 
-        layout = self.binned
-        return WindowLayout(scaled(layout.size), scaled(layout.step), layout.count, scaled(layout.first))
-
-
-def coarse_layout(shape_xyz: Triple, windows: Sequence[Triple], overlap: tuple[float, float, float]) -> CoarseLayout:
-    """Return the windows of the coarse pass.
-
-    Raises
-    ------
-    ConfigError
-        Windows cannot be so.
-    """
-    if not windows or min(min(window) for window in windows) < 2:
-        raise ConfigError(f"correlation windows are {list(windows)} voxels; each must be at least 2 along every axis")
-    if not all(0.0 <= share < 1.0 for share in overlap):
-        raise ConfigError(f"the overlap of the correlation windows is {overlap}; it must be at least 0 and below 1")
-    size = coarse_size(windows)
-    bins = tuple(max(1, round(w / COARSE_CELLS)) for w in size)
-    cells = tuple(-(-n // width) for n, width in zip(shape_xyz, bins, strict=True))
-    binned_size = tuple(max(2, round(w / width)) for w, width in zip(size, bins, strict=True))
-    return CoarseLayout(
-        layout_windows(_triple(cells), _triple(binned_size), overlap), _triple(bins), _triple(cells[::-1])
-    )
-
-
-def coarse_sums(a: NDArray[np.float32], b: NDArray[np.float32], coarse: CoarseLayout) -> MapSums:
-    """Return what the correlation of two volumes is made of after binning."""
-    before, after = margins(coarse.binned, coarse.cells_zyx, COARSE_RADIUS)
-    binned_a, binned_b = (bin_volume(volume, coarse, before, after) for volume in (a, b))
-    return map_sums(binned_a, binned_b, coarse.binned, before, COARSE_RADIUS)
-
-
-def coarse_field(sums: MapSums, coarse: CoarseLayout) -> tuple[Floats, bool]:
-    """Return a filled and filtered field of displacements in voxels, and whether particle images are long."""
-    peaks = find_peaks(sums.correlation())
-    raw, second = absolute(peaks, np.zeros(peaks.offset.shape))
-    nowhere = np.zeros(peaks.found.shape, dtype=np.bool_)
-    displacement, _ = validate_vectors(raw, second, peaks.found, nowhere, expected_noise(peaks.width))
-    width = undiluted(typical_width(peaks.width) * np.asarray(coarse.bins))
-    is_elongated = bool(np.any(width >= ELONGATED_WIDTH))
-    return smooth_field(fill_field(displacement), is_elongated) * np.asarray(coarse.bins), is_elongated
-
-
-def bin_volume(volume: NDArray[np.float32], coarse: CoarseLayout, before: Triple, after: Triple) -> NDArray[np.float32]:
-    """Return sums over bins, scaled to a largest magnitude of 1, with margins of zeros; the last bins may be cut."""
-    padded = tuple(m + n + k for m, n, k in zip(before, coarse.cells_zyx, after, strict=True))
-    sums = np.zeros(padded, dtype=np.float32)
-    inside = tuple(slice(m, m + n) for m, n in zip(before, coarse.cells_zyx, strict=True))
-    share_out(sum_bins, coarse.cells_zyx[0], volume, coarse.bins[::-1], sums[inside])
-    largest = float(max(np.max(sums), -np.min(sums)))
-    if largest > 0.0:
-        sums *= np.float32(1.0 / largest)
-    return sums
+    def field(self, sums: MapSums) -> tuple[Floats, WindowLayout, bool]:
+        """Return a filled and filtered field, its windows, both in voxels, and whether particle images are long."""
+        peaks = find_peaks(sums.correlation())
+        raw, second = absolute(peaks, np.zeros(peaks.offset.shape))
+        nowhere = np.zeros(peaks.found.shape, dtype=np.bool_)
+        displacement, _ = validate_vectors(raw, second, peaks.found, nowhere, expected_noise(peaks.width))
+        width = undiluted(typical_width(peaks.width) * np.asarray(self.bins))
+        is_elongated = bool(np.any(width >= ELONGATED_WIDTH))
+        size, step, first = (
+            triple(n * width for n, width in zip(cells, self.bins, strict=True))
+            for cells in (self.layout.size, self.layout.step, self.layout.first)
+        )
+        found = smooth_field(fill_field(displacement), is_elongated) * np.asarray(self.bins)
+        return found, WindowLayout(size, step, self.layout.count, first), is_elongated
 
 
 @njit(cache=True, nogil=True)
@@ -146,10 +113,6 @@ def sum_bins(part: tuple[int, int], volume: NDArray[np.float32], bins: Triple, s
                 sums[cell_z, cell_y, cell_x] = total
 
 
-def _triple(values: tuple[int, ...]) -> Triple:
-    return values[0], values[1], values[2]
-
-
 # Strong curvature leaves up to two voxels after the coarse pass and after each change of windows; later one is enough.
 FIRST_RADIUS = 2
 LATER_RADIUS = 1
@@ -166,31 +129,6 @@ SMALLEST_VALID_FRACTION = 0.25
 
 
 @dataclass(frozen=True)
-class CorrelationSettings:
-    """How two volumes are correlated.
-
-    Attributes
-    ----------
-    windows : sizes of the interrogation windows in voxels along (x, y, z), coarse to fine; the last gives the vectors
-    overlap : share of a window in common with the next one along (x, y, z), 0 <= overlap < 1
-    dt_s : time from the first volume to the second, or None where it is not known
-    exponent : power of the intensities that is correlated, 0 < exponent <= 1, negative ones being zero where it is
-        below 1. In volumes of a solver that sharpens, as EM does, the brightest particles outweigh all others and are
-        narrower than a voxel: the root lets the others speak and makes peaks wide enough to be located. In volumes with
-        a noisy background it raises that, and harms.
-    """
-
-    windows: Sequence[Triple]
-    overlap: tuple[float, float, float]
-    dt_s: float | None = None
-    exponent: float = 1.0
-
-    def layout(self, shape_xyz: Triple) -> WindowLayout:
-        """Return the final windows in a volume of so many voxels, each of which gives a vector."""
-        return layout_windows(shape_xyz, self.windows[-1], self.overlap)
-
-
-@dataclass(frozen=True)
 class Pass:
     """One pass over the deformed volumes: its windows, how far it looks, and whether its vectors are the result."""
 
@@ -199,14 +137,8 @@ class Pass:
     is_last: bool = False
 
 
-@dataclass(frozen=True, eq=False)
-class Pair:
-    """Two volumes ready for deformation: their splines, and where both may be used (size 0 for everywhere)."""
-
-    a: Spline
-    b: Spline
-    mask: NDArray[np.bool_]
-    shape_xyz: Triple
+# Two volumes ready for deformation: their splines, and where both may be used (size 0 for everywhere).
+Pair = tuple[Spline, Spline, NDArray[np.bool_]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,11 +152,6 @@ class Measured:
     valid_fraction: Floats
     uncertainty: Floats
     width: Floats
-
-    @property
-    def is_long(self) -> NDArray[np.bool_]:
-        """Along which of x, y, z particle images are long."""
-        return self.width >= ELONGATED_WIDTH
 
 
 def correlate(
@@ -254,40 +181,47 @@ def correlate(
     ConfigError
         No window, one smaller than 2 voxels, an overlap outside 0 to 1, or a time or an exponent out of range.
     """
-    windows, overlap = settings.windows, settings.overlap
+    _ensure_possible(settings)
     report = progress or (lambda units: None)
-    coarse = coarse_layout(grid.shape_xyz, windows, overlap)
+    coarse = Coarse.over(grid.shape_xyz, settings)
     sums, ready = None, []
-    for a, b in pairs:
-        _check(a, b, grid, mask, settings)
-        usable, a, b = _usable_voxels(a, b, mask)
-        a, b = _compressed(a, settings.exponent), _compressed(b, settings.exponent)
-        found = coarse_sums(a, b, coarse)
-        sums = found if sums is None else sums + found
-        ready.append(Pair(spline_coefficients(a), spline_coefficients(b), usable, grid.shape_xyz))
-    if sums is None:
-        raise InputError("there are no pairs of volumes to correlate")
-    predictor, is_elongated = coarse_field(sums, coarse)
-    layout = coarse.in_voxels
-    report(1)
-    # One BLAS thread: with more, the bits of the predictor would depend on their number.
-    with _matrix_libraries().limit(limits=1, user_api="blas"):
-        for step in plan(grid.shape_xyz, windows, overlap):
-            measured = _refine(ready, _between_layouts(predictor, layout, step.layout), step, is_elongated)
-            filled, is_elongated = fill_field(measured.displacement), bool(measured.is_long.any())
+    # One BLAS thread: with more, the bits of products of matrices would depend on their number.
+    with threadpool_limits(limits=1, user_api="blas"):
+        for pair in pairs:
+            usable, *volumes = _usable_voxels(*pair, mask, grid)
+            if settings.exponent != 1.0:
+                power = np.float32(settings.exponent)
+                volumes = [np.power(np.maximum(volume, np.float32(0.0)), power) for volume in volumes]
+            found = coarse.sums(volumes)
+            sums = found if sums is None else sums + found
+            a, b = (spline_coefficients(volume) for volume in volumes)
+            ready.append((a, b, usable))
+        if sums is None:
+            raise InputError("there are no pairs of volumes to correlate")
+        predictor, layout, is_elongated = coarse.field(sums)
+        report(1)
+        for step in plan(grid.shape_xyz, settings):
+            if layout != step.layout:
+                old, layout = layout, step.layout
+                x, y, z = (spline_matrix(old.centres_voxel(k), layout.centres_voxel(k)) for k in range(3))
+                predictor = np.einsum("ck,bj,ai,kjid->cbad", z, y, x, predictor, optimize=True)
+            measured = _refine(ready, predictor, step, is_elongated)
+            is_long = measured.width >= ELONGATED_WIDTH
+            filled, is_elongated = fill_field(measured.displacement), bool(is_long.any())
             predictor = smooth_field(filled, is_elongated)
-            layout = step.layout
             report(1)
-    uncertainty = np.hypot(measured.uncertainty, unresolved(filled, is_elongated))
+    # Long particles mix the flow into the components that are located well; along their length noise is worse.
+    sigma = np.where(is_long, measured.width / np.sqrt(2.0), 0.0)
+    mixed = np.where(is_long, 0.0, mixing(filled, sigma, layout.step))
     return VectorField(
         grid=layout.grid(grid),
-        displacement_voxel=_unmixed(measured, filled, layout),
+        displacement_voxel=measured.displacement - mixed,
         displacement_raw_voxel=measured.raw,
         correlation=measured.peaks.height,
         peak_ratio=measured.peaks.ratio,
         valid_fraction=measured.valid_fraction,
         flag=measured.flag,
-        uncertainty_voxel=uncertainty,
+        uncertainty_voxel=np.hypot(measured.uncertainty, unresolved(filled, is_elongated)),
         voxel_mm=grid.spacing_mm,
         dt_s=settings.dt_s,
         window_voxel=layout.size,
@@ -299,34 +233,26 @@ def count_passes(windows: Sequence[Triple]) -> int:
     return 1 + len(_refined_sizes(windows))
 
 
-def _check(
-    a: NDArray[np.float32],
-    b: NDArray[np.float32],
-    grid: Grid,
-    mask: NDArray[np.bool_] | None,
-    settings: CorrelationSettings,
-) -> None:
-    """Raise where the arguments of `correlate` do not belong together."""
-    for name, array in (("first volume", a), ("second volume", b), ("mask", mask)):
-        if array is not None and array.shape != grid.shape_zyx:
-            raise InputError(f"the {name} has shape {array.shape} (z, y, x); its grid has {grid.shape_zyx}")
-    dt_s, exponent = settings.dt_s, settings.exponent
+def _ensure_possible(settings: CorrelationSettings) -> None:
+    """Refuse settings that no volumes can be correlated with."""
+    windows, overlap, dt_s, exponent = settings.windows, settings.overlap, settings.dt_s, settings.exponent
+    if not windows or min(min(window) for window in windows) < 2:
+        raise ConfigError(f"correlation windows are {list(windows)} voxels; each must be at least 2 along every axis")
+    if not all(0.0 <= share < 1.0 for share in overlap):
+        raise ConfigError(f"the overlap of the correlation windows is {overlap}; it must be at least 0 and below 1")
     if dt_s is not None and not dt_s > 0.0:
         raise ConfigError(f"the time between the volumes is {dt_s} s; it must be positive")
     if not 0.0 < exponent <= 1.0:
         raise ConfigError(f"the exponent of the correlated intensities is {exponent}; it must be above 0 and at most 1")
 
 
-@lru_cache(maxsize=1)
-def _matrix_libraries() -> ThreadpoolController:
-    """Return the libraries whose threads can be limited; looking for them takes milliseconds."""
-    return ThreadpoolController()
-
-
 def _usable_voxels(
-    a: NDArray[np.float32], b: NDArray[np.float32], mask: NDArray[np.bool_] | None
+    a: NDArray[np.float32], b: NDArray[np.float32], mask: NDArray[np.bool_] | None, grid: Grid
 ) -> tuple[NDArray[np.bool_], NDArray[np.float32], NDArray[np.float32]]:
     """Return where both volumes may be used (size 0 for everywhere), and both with zeros elsewhere."""
+    for name, array in (("first volume", a), ("second volume", b), ("mask", mask)):
+        if array is not None and array.shape != grid.shape_zyx:
+            raise InputError(f"the {name} has shape {array.shape} (z, y, x); its grid has {grid.shape_zyx}")
     # What is not finite in a volume shows in its extremes.
     if mask is None and all(np.isfinite(end(volume)) for volume in (a, b) for end in (np.min, np.max)):
         return np.zeros((0, 0, 0), dtype=np.bool_), a, b
@@ -334,13 +260,6 @@ def _usable_voxels(
     usable = finite if mask is None else finite & mask
     zero = np.float32(0.0)
     return usable, np.where(usable, a, zero), np.where(usable, b, zero)
-
-
-def _compressed(volume: NDArray[np.float32], exponent: float) -> NDArray[np.float32]:
-    """Return a power of the intensities, zero where they are negative; the volume itself for an exponent of 1."""
-    if exponent == 1.0:
-        return volume
-    return np.power(np.maximum(volume, np.float32(0.0)), np.float32(exponent))
 
 
 def _refined_sizes(windows: Sequence[Triple]) -> list[Triple]:
@@ -352,34 +271,26 @@ def _refined_sizes(windows: Sequence[Triple]) -> list[Triple]:
     return [*larger, *[windows[-1]] * FINAL_PASSES]
 
 
-def plan(shape_xyz: Triple, windows: Sequence[Triple], overlap: tuple[float, float, float]) -> list[Pass]:
+def plan(shape_xyz: Triple, settings: CorrelationSettings) -> list[Pass]:
     """Return the passes after the coarse one."""
-    sizes = _refined_sizes(windows)
+    sizes = _refined_sizes(settings.windows)
     passes = []
     for number, size in enumerate(sizes):
         changed = number == 0 or size != sizes[number - 1]
         radius = FIRST_RADIUS if changed else LATER_RADIUS
-        passes.append(Pass(layout_windows(shape_xyz, size, overlap), radius))
+        passes.append(Pass(settings.layout(shape_xyz, size), radius))
     passes[-1] = Pass(passes[-1].layout, LAST_RADIUS, is_last=True)
     return passes
 
 
-def _between_layouts(field: Floats, old: WindowLayout, new: WindowLayout) -> Floats:
-    """Return a field at the centres of other windows."""
-    if old == new:
-        return field
-    x, y, z = (spline_matrix(old.centres_voxel(k), new.centres_voxel(k)) for k in range(3))
-    return np.einsum("ck,bj,ai,kjid->cbad", z, y, x, field, optimize=True)
-
-
 def _refine(pairs: Sequence[Pair], predictor: Floats, step: Pass, is_elongated: bool) -> Measured:
     """Return what is measured in volumes deformed by `predictor`, given at the windows of `step`, in voxels."""
-    layout, shape = step.layout, pairs[0].shape_xyz
-    before, after = margins(layout, (shape[2], shape[1], shape[0]), step.radius)
-    to_voxels = matrices_to_voxels(layout, shape)
+    layout, shape_zyx = step.layout, pairs[0][0].shape_zyx
+    before, after = margins(layout, shape_zyx, step.radius)
+    to_voxels = matrices_to_voxels(layout, shape_zyx[::-1])
     parts = []
     for pair in pairs:
-        a, b, valid = deform_pair(pair.a, pair.b, pair.mask, predictor, to_voxels, before, after)
+        a, b, valid = deform_pair(*pair, predictor, to_voxels, before, after)
         fraction = valid_shares(valid, layout, before)
         moments = pair_moments(a, b, valid, layout, before) if step.is_last or is_elongated else None
         parts.append((map_sums(a, b, layout, before, step.radius), fraction, moments))
@@ -391,34 +302,18 @@ def _refine(pairs: Sequence[Pair], predictor: Floats, step: Pass, is_elongated: 
     if moments_of[0] is not None:
         rest, deviation, response = gauss_newton(reduce(add, moments_of), layout, width / np.sqrt(2.0))
         uncertainty = deviation / response
-    raw, second = absolute(_with_steps(peaks, rest, width), predictor)
+    # Gauss-Newton steps take the place of offsets along elongated axes. One longer than the peak is wide lies outside
+    # the range in which the volumes change linearly. Where all axes are short, steps and peaks err in part
+    # independently, and a share of the step is taken; where they differ by half a voxel it has met a lost particle.
+    elongated, differ = width >= ELONGATED_WIDTH, rest - peaks.offset
+    elsewhere = 0.0 if elongated.any() else STEP_SHARE * (np.abs(differ) < LARGEST_DIFFERENCE)
+    share = np.where(elongated, np.abs(rest) <= width, elsewhere)
+    offset = np.where(share > 0.0, peaks.offset + share * differ, peaks.offset)
+    raw, second = absolute(replace(peaks, offset=offset), predictor)
     masked = valid_fraction < SMALLEST_VALID_FRACTION
     displacement, flag = validate_vectors(raw, second, peaks.found, masked, expected_noise(peaks.width))
     uncertainty[~peaks.found | masked] = np.nan
     return Measured(raw, displacement, flag, peaks, valid_fraction, uncertainty, width)
-
-
-def _unmixed(measured: Measured, filled: Floats, layout: WindowLayout) -> Floats:
-    """Return the displacements without what long particles mix into the components that are located well.
-
-    Along the particles' length noise is worse than the mixture.
-    """
-    sigma = np.where(measured.is_long, measured.width / np.sqrt(2.0), 0.0)
-    return measured.displacement - np.where(measured.is_long, 0.0, mixing(filled, sigma, layout.step))
-
-
-def _with_steps(peaks: Peaks, rest: Floats, width: Floats) -> Peaks:
-    """Return the peaks with Gauss-Newton steps in place of their offsets along elongated axes, and a share elsewhere.
-
-    A step longer than the peak is wide lies outside the range in which the volumes change linearly. Where all axes are
-    short, steps and peaks err in part independently; where they differ by half a voxel the step has met a lost
-    particle, and the peak is believed.
-    """
-    elongated = width >= ELONGATED_WIDTH
-    differ = rest - peaks.offset
-    elsewhere = 0.0 if elongated.any() else STEP_SHARE * (np.abs(differ) < LARGEST_DIFFERENCE)
-    share = np.where(elongated, np.abs(rest) <= width, elsewhere)
-    return replace(peaks, offset=np.where(share > 0.0, peaks.offset + share * differ, peaks.offset))
 
 
 # How much memory a correlation takes, from the size of its volumes and its windows.
@@ -438,7 +333,7 @@ MOMENT_BYTES = 8
 def held_bytes(shape_xyz: Triple, settings: CorrelationSettings) -> float:
     """Return what a correlation of two volumes holds in memory at once, in bytes, without the program."""
     of_passes = []
-    for step in plan(shape_xyz, settings.windows, settings.overlap):
+    for step in plan(shape_xyz, settings):
         # Moments are those of the last pass, and of few others.
         cells = math.prod(starts.size for starts in cells_of(step.layout).start) if step.is_last else 0
         shifts = (2 * step.radius + 1) ** 3 * math.prod(step.layout.count)

@@ -19,14 +19,7 @@ from scipy.interpolate import CubicSpline
 
 from lfpiv_cli.arrays import Floats
 from lfpiv_cli.flow.windows import Triple, WindowLayout
-from lfpiv_cli.simd.block_sums import (
-    MOST_TAPS,
-    NEIGHBOURS,
-    interpolate,
-    range_of_all,
-    range_reference,
-    spline_weights,
-)
+from lfpiv_cli.simd.block_sums import MOST_TAPS, NEIGHBOURS, interpolate, range_of_all, range_reference, spline_weights
 from lfpiv_cli.threads import share_out
 
 # Sources lie between the first and the last voxel's centre: the four taps of a cubic B-spline reach one coefficient
@@ -209,7 +202,10 @@ def deform_planes(
     row = shape[2] + 2 * SPLINE_PAD
     plane = row * (shape[1] + 2 * SPLINE_PAD)
     for z in range(part[0], part[1]):
-        half_here = expand_plane(half, along_z[z], along_y, along_x)
+        at_windows = np.dot(along_z[z], half.reshape(half.shape[0], half[0].size)).reshape(half.shape[1:])
+        half_here = np.empty((3, shape[1], shape[2]), dtype=np.float32)
+        for axis in range(3):
+            np.dot(np.dot(along_y, at_windows[axis]), along_x, half_here[axis])
         moved = np.empty((3, shape[2] + NEIGHBOURS), dtype=np.float32)
         flat_moved = moved.reshape(moved.size)
         weights = np.empty(3 * MOST_TAPS * NEIGHBOURS, dtype=np.float32)
@@ -221,7 +217,12 @@ def deform_planes(
             seen = valid[target][here]
             bound_row(half_here[:, y], shape, z, y, moved, seen)
             if mask.size:
-                mask_row(mask, moved, z, y, seen)
+                # A voxel for which either source lies nearest to a voxel that the mask leaves out.
+                for x in range(shape[2]):
+                    u, v, w = moved[0, x], moved[1, x], moved[2, x]
+                    seen_a = mask[int(np.floor(z - w + 0.5)), int(np.floor(y - v + 0.5)), int(np.floor(x - u + 0.5))]
+                    seen_b = mask[int(np.floor(z + w + 0.5)), int(np.floor(y + v + 0.5)), int(np.floor(x + u + 0.5))]
+                    seen[x] &= np.uint8(seen_a and seen_b)
             begin = SLACK + (z + SPLINE_PAD) * plane + (y + SPLINE_PAD) * row + SPLINE_PAD
             at = begin
             while at < begin + shape[2]:
@@ -231,19 +232,6 @@ def deform_planes(
                 at += width
             copy_seen(lines[0], seen, deformed_a[target][here])
             copy_seen(lines[1], seen, deformed_b[target][here])
-
-
-@njit(cache=True)
-def expand_plane(
-    half: NDArray[np.float32], along_z: NDArray[np.float32], along_y: NDArray[np.float32], along_x: NDArray[np.float32]
-) -> NDArray[np.float32]:
-    """Return the half displacements (3, rows, columns) of one plane; `along_z` is its row of the matrix."""
-    nz, _, ny, nx = half.shape
-    at_windows = np.dot(along_z, half.reshape(nz, 3 * ny * nx)).reshape(3, ny, nx)
-    at_voxels = np.empty((3, along_y.shape[0], along_x.shape[1]), dtype=np.float32)
-    for axis in range(3):
-        np.dot(np.dot(along_y, at_windows[axis]), along_x, at_voxels[axis])
-    return at_voxels
 
 
 @njit(cache=True)
@@ -307,13 +295,3 @@ def bound_row(
         valid[x] = (abs(u) <= reach_x) & (abs(v) <= reach_y) & (abs(w) <= reach_z)
     for axis in range(3):
         moved[axis, columns:] = moved[axis, columns - 1]
-
-
-@njit(cache=True)
-def mask_row(mask: NDArray[np.bool_], moved: NDArray[np.float32], z: int, y: int, valid: NDArray[np.uint8]) -> None:
-    """Strike out the voxels of a row for which either source lies nearest to a voxel that the mask leaves out."""
-    for x in range(valid.size):
-        u, v, w = moved[0, x], moved[1, x], moved[2, x]
-        seen_a = mask[int(np.floor(z - w + 0.5)), int(np.floor(y - v + 0.5)), int(np.floor(x - u + 0.5))]
-        seen_b = mask[int(np.floor(z + w + 0.5)), int(np.floor(y + v + 0.5)), int(np.floor(x + u + 0.5))]
-        valid[x] &= np.uint8(seen_a and seen_b)

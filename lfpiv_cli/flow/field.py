@@ -75,9 +75,7 @@ class VectorField:
         return velocity
 
 
-# What follows from the gradients of a velocity field.
-#
-# Axes: arrays `[z, y, x]`, vectors (u, v, w) along (x, y, z) last; rates in 1/s.
+# What follows from the gradients of a velocity field; rates in 1/s.
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,7 +104,14 @@ class Derived:
 
 def derived_fields(field: VectorField) -> Derived:
     """Return the derived fields by central differences, one-sided at the faces and exact for quadratic flows there."""
-    return derived_from(velocity_gradient(field))
+    velocity = field.velocity
+    gradient = np.full((*velocity.shape, 3), np.nan)
+    for axis, spacing_mm in enumerate(field.grid.spacing_mm):
+        planes = field.grid.shape_xyz[axis]
+        if planes > 1:
+            step_m = spacing_mm * MM_TO_M
+            gradient[..., axis] = np.gradient(velocity, step_m, axis=2 - axis, edge_order=2 if planes > 2 else 1)
+    return derived_from(gradient)
 
 
 def derived_from(gradient: Floats) -> Derived:
@@ -121,18 +126,6 @@ def derived_from(gradient: Floats) -> Derived:
         strain_rate=np.sqrt(2.0 * strain_squared),
         q_criterion=0.5 * (np.sum(rotation**2, axis=(-1, -2)) - strain_squared),
     )
-
-
-def velocity_gradient(field: VectorField) -> Floats:
-    """Return d(u, v, w)/d(x, y, z), (nz, ny, nx, 3, 3) in 1/s: the component, then the direction."""
-    velocity = field.velocity
-    gradient = np.full((*velocity.shape, 3), np.nan)
-    for axis, spacing_mm in enumerate(field.grid.spacing_mm):
-        planes = field.grid.shape_xyz[axis]
-        if planes > 1:
-            step_m = spacing_mm * MM_TO_M
-            gradient[..., axis] = np.gradient(velocity, step_m, axis=2 - axis, edge_order=2 if planes > 2 else 1)
-    return gradient
 
 
 # Mean and fluctuations over the vector fields of a batch.
@@ -207,8 +200,6 @@ def statistics_of(fields: Iterable[VectorField]) -> Statistics:
 # the divergence that the stated standard deviations make, a ratio of 1 confirms them; a large one says that they are
 # too small. Two measurements of one flow by different ways differ likewise by what their standard deviations let
 # expect.
-#
-# Axes: arrays `[z, y, x]`, components last.
 
 
 # Fewer places than this tell no ratio.
@@ -228,8 +219,8 @@ def divergence_over_stated(field: VectorField) -> float | None:
     inner = tuple(n - 2 for n in field.flag.shape)
     divergence, variance = np.zeros(inner), np.zeros(inner)
     for axis, spacing_mm in enumerate(field.grid.spacing_mm):
-        divergence = divergence + _difference(moved[..., axis], axis, 1.0, -1.0) / (2.0 * spacing_mm)
-        variance = variance + _difference(sigma[..., axis] ** 2, axis, 1.0, 1.0) / (2.0 * spacing_mm) ** 2
+        divergence = divergence + _beside(moved[..., axis], axis, -1.0) / (2.0 * spacing_mm)
+        variance = variance + _beside(sigma[..., axis] ** 2, axis, 1.0) / (2.0 * spacing_mm) ** 2
     return _ratio(divergence, np.sqrt(variance))
 
 
@@ -255,12 +246,12 @@ def _sigma_mm(field: VectorField) -> Floats | None:
     return None if field.uncertainty_voxel is None else field.uncertainty_voxel * field.voxel_mm
 
 
-def _difference(values: Floats, axis: int, after: float, before: float) -> Floats:
-    """Return after * values one further along x, y or z (0, 1, 2) + before * values one back, of the inner places."""
+def _beside(values: Floats, axis: int, sign: float) -> Floats:
+    """Return the values one further along x, y or z (0, 1, 2) and sign times those one back, of the inner places."""
     inner = [slice(1, -1)] * 3
     ahead, back = list(inner), list(inner)
     ahead[2 - axis], back[2 - axis] = slice(2, None), slice(None, -2)
-    return np.asarray(after * values[tuple(ahead)] + before * values[tuple(back)])
+    return np.asarray(values[tuple(ahead)] + sign * values[tuple(back)])
 
 
 def _ratio(errors: Floats, sigma: Floats) -> float | None:

@@ -15,23 +15,15 @@ Axes: cells and windows are ordered (z, y, x); vectors hold (u, v, w) along (x, 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from math import gcd
-
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from lfpiv_cli.arrays import Floats
-from lfpiv_cli.flow.maps import SMALLEST_BLOCK
-from lfpiv_cli.flow.windows import Triple, WindowLayout
+from lfpiv_cli.flow.sums import cells_of
+from lfpiv_cli.flow.windows import Triple, WindowLayout, triple
 from lfpiv_cli.simd.block_sums import MOMENTS
-from lfpiv_cli.simd.block_sums import moments as lane_moments
-from lfpiv_cli.simd.vectors import LANES
 from lfpiv_cli.threads import share_out
 
-# Cells along an axis of a window, at least, where it has as many voxels: groups enough for a variance.
-CELLS_PER_WINDOW = 4
 # Three components and the gain. Moments are those of their derivatives, and those of these with B - A.
 UNKNOWNS = 4
 PRODUCTS = UNKNOWNS * (UNKNOWNS + 1) // 2
@@ -47,66 +39,6 @@ SMALLEST_PIVOT = 1e-6
 SMALLEST_RESPONSE = 0.25
 
 
-Starts = tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]
-
-
-@dataclass(frozen=True, eq=False)
-class Cells:
-    """How the windows of one layout are made of cells, along (z, y, x).
-
-    Cell k along an axis covers `size[k]` voxels from `start[k]` on, counted from the first window's first voxel; window
-    k is the sum of cells k hop ... k hop + per_window - 1.
-    """
-
-    start: Starts
-    size: Starts
-    per_window: Triple
-    hop: Triple
-
-
-def cells_of(layout: WindowLayout) -> Cells:
-    """Return the cells that make up the windows, axis by axis."""
-    axes = [_cells_along(layout.size[axis], layout.step[axis], layout.count[axis]) for axis in (2, 1, 0)]
-    start, size, per_window, hop = ((a[0], a[1], a[2]) for a in zip(*axes, strict=True))
-    return Cells(start, size, per_window, hop)
-
-
-def _cells_along(size: int, step: int, count: int) -> tuple[NDArray[np.int64], NDArray[np.int64], int, int]:
-    """Return the starts and sizes of the cells, the cells per window and the hop along one axis.
-
-    Windows share cells of their step's and size's common divisor, or parts of these; where it is small, each window has
-    cells of its own.
-    """
-    shared = gcd(size, step)
-    if shared < SMALLEST_BLOCK or step > size:
-        first, length, hop = step * np.arange(count), size, 1
-    else:
-        first, length, hop = shared * np.arange(((count - 1) * step + size) // shared), shared, step // shared
-    parts = min(length, -(-CELLS_PER_WINDOW * length // size))
-    edges = np.arange(parts + 1) * length // parts
-    start = (first[:, np.newaxis] + edges[:-1]).ravel()
-    return start, np.tile(np.diff(edges), first.size), parts * (size // length), parts * hop
-
-
-def pair_moments(
-    a: NDArray[np.float32], b: NDArray[np.float32], valid: NDArray[np.uint8], layout: WindowLayout, before: Triple
-) -> Floats:
-    """Return the moments of all cells of two deformed volumes; of several pairs these add up.
-
-    Parameters
-    ----------
-    a, b, valid : of `deform_pair`, with a margin of at least 1 around all windows
-    layout : windows, in voxels of the volume without margins
-    before : the margins before the volume, (z, y, x)
-    """
-    cells = cells_of(layout)
-    first = (layout.first[2] + before[0], layout.first[1] + before[1], layout.first[0] + before[2])
-    count = tuple(starts.size for starts in cells.start)
-    found = np.empty((*count, MOMENTS))
-    share_out(sum_cells, count[0] * count[1], (a, b), valid, first, cells.start, cells.size, found)
-    return found
-
-
 def gauss_newton(moments: Floats, layout: WindowLayout, particle_sigma: Floats) -> tuple[Floats, Floats, Floats]:
     """Return the rest displacements, their standard deviations and the response to a predictor, (nz, ny, nx, 3) each.
 
@@ -119,63 +51,19 @@ def gauss_newton(moments: Floats, layout: WindowLayout, particle_sigma: Floats) 
     particle_sigma : (3,) standard deviation of a particle image along x, y, z, voxels
     """
     cells = cells_of(layout)
-    groups = [
-        _cells_a_group(per_window, length, sigma)
-        for per_window, length, sigma in zip(cells.per_window, layout.size[::-1], particle_sigma[::-1], strict=True)
-    ]
-    grouped = (groups[0], groups[1], groups[2])
-    count = layout.count_zyx
+    grouped = []
+    for per_window, length, sigma in zip(cells.per_window, layout.size[::-1], particle_sigma[::-1], strict=True):
+        # The fewest cells, a divisor of those of a window, that are `GROUP_SIGMAS` long; or all.
+        long_enough = (
+            number
+            for number in range(1, per_window)
+            if per_window % number == 0 and number * length >= GROUP_SIGMAS * sigma * per_window
+        )
+        grouped.append(next(long_enough, per_window))
+    count = layout.count[::-1]
     solved = np.full((3, *count, 3), np.nan)
-    share_out(solve_windows, count[0] * count[1], moments, cells.per_window, cells.hop, grouped, solved)
+    share_out(solve_windows, count[0] * count[1], moments, cells.per_window, cells.hop, triple(grouped), solved)
     return solved[0], solved[1], solved[2]
-
-
-def _cells_a_group(per_window: int, length: int, sigma: float) -> int:
-    """Return the fewest cells, a divisor of those of a window of `length`, that are `GROUP_SIGMAS` long; or all."""
-    for cells in range(1, per_window):
-        if per_window % cells == 0 and cells * length >= GROUP_SIGMAS * sigma * per_window:
-            return cells
-    return per_window
-
-
-@njit(cache=True, nogil=True)
-def sum_cells(
-    part: tuple[int, int],
-    pair: tuple[NDArray[np.float32], NDArray[np.float32]],
-    valid: NDArray[np.uint8],
-    first: Triple,
-    start: Starts,
-    size: Starts,
-    found: Floats,
-) -> None:
-    """Write the moments of cells, rows `part` of (cells z, y, x, MOMENTS), of windows that begin at the voxel `first`.
-
-    The upper triangle of the products of (dM/dx, dM/dy, dM/dz, M), row by row, those of each with B - A, and the
-    squares of the slopes of (B - A) / 2. Voxels with a neighbour that is not valid are left out: their gradient would
-    be that of the rim.
-    """
-    a, b = pair
-    count = found.shape[:3]
-    row, plane = a.shape[2], a.shape[1] * a.shape[2]
-    flat_a, flat_b, flat_valid = a.reshape(a.size), b.reshape(b.size), valid.reshape(valid.size)
-    length = max(LANES, start[2][-1] + size[2][-1])
-    for job in range(part[0], part[1]):
-        cz, cy = job // count[1], job % count[1]
-        begin = (first[0] + start[0][cz]) * plane + (first[1] + start[1][cy]) * row + first[2]
-        # Summed over the planes and rows of the cells first, many columns at once; float32 serves for so few.
-        columns = np.empty((MOMENTS, length), dtype=np.float32)
-        flat = columns.reshape(columns.size)
-        for lane in range(0, length, LANES):
-            # The last lanes begin early enough to end with the others.
-            x = min(lane, length - LANES)
-            places = (begin + x, plane, row)
-            lane_moments(flat, (x, length), flat_a, flat_b, flat_valid, places, (size[0][cz], size[1][cy]))
-        for cx in range(count[2]):
-            for moment in range(MOMENTS):
-                total = 0.0
-                for x in range(start[2][cx], start[2][cx] + size[2][cx]):
-                    total += columns[moment, x]
-                found[cz, cy, cx, moment] = total
 
 
 @njit(cache=True)
@@ -295,7 +183,12 @@ def write_deviation(groups: Floats, inverse: Floats, solution: Floats, deviation
             dependent *= 2.0 - 1.0 / layers
     if used < FEWEST_GROUPS * dependent:
         return
-    sum_neighbours(rest)
+    # Of each place and the next along z, y and x, in place; the last ones along each axis are left half done.
+    for stride in (rest[0].size, rest[0, 0].size, rest[0, 0, 0].size):
+        flat = rest.reshape(rest.size)
+        here, after = flat[: flat.size - stride], flat[stride:]
+        for i in range(here.size):
+            here[i] += after[i]
     for i in range(3):
         variance = 0.0
         for z in range(nz + 1):
@@ -304,16 +197,3 @@ def write_deviation(groups: Floats, inverse: Floats, solution: Floats, deviation
                     variance += rest[z, y, x, i] * rest[z, y, x, i]
         # Each group is in two blocks along each axis.
         deviation[i] = np.sqrt(variance / 8.0 / (1.0 - dependent / used))
-
-
-@njit(cache=True)
-def sum_neighbours(values: Floats) -> None:
-    """Replace values (z, y, x, 3) by the sums of those from each place to the next along z, y and x, in place.
-
-    The last ones along each axis are left half done.
-    """
-    for stride in (values[0].size, values[0, 0].size, values[0, 0, 0].size):
-        flat = values.reshape(values.size)
-        here, after = flat[: flat.size - stride], flat[stride:]
-        for i in range(here.size):
-            here[i] += after[i]

@@ -218,22 +218,17 @@ def fill_field(displacement: Floats) -> Floats:
 
 
 @njit(cache=True)
-def sort_columns(rows: Floats) -> None:
-    """Sort each column of (NEIGHBOURHOOD, LANES) in place: the same comparisons for all, many at once."""
-    for pair in range(NETWORK.shape[0]):
-        upper, lower = rows[NETWORK[pair, 0]], rows[NETWORK[pair, 1]]
-        for lane in range(LANES):
-            one, other = upper[lane], lower[lane]
-            upper[lane], lower[lane] = min(one, other), max(one, other)
-
-
-@njit(cache=True)
 def medians(rows: Floats, middle: Floats) -> None:
     """Write the median of the finite values of each column of (NEIGHBOURHOOD, LANES), 0 without any; sorts `rows`.
 
     Infinity stands for what is not known.
     """
-    sort_columns(rows)
+    # The same comparisons for all columns, many at once.
+    for pair in range(NETWORK.shape[0]):
+        upper, lower = rows[NETWORK[pair, 0]], rows[NETWORK[pair, 1]]
+        for lane in range(LANES):
+            one, other = upper[lane], lower[lane]
+            upper[lane], lower[lane] = min(one, other), max(one, other)
     for lane in range(LANES):
         count = 0
         for place in range(NEIGHBOURHOOD):

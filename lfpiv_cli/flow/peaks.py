@@ -93,12 +93,7 @@ def find_peaks(maps: Floats) -> Peaks:
     ratio = np.where(height > 0.0, np.minimum(ratio, LARGEST_PEAK_RATIO), 0.0)
     vectors = (*windows, 3)
     return Peaks(
-        offset.reshape(vectors),
-        height,
-        second_offset.reshape(vectors),
-        second_height,
-        ratio,
-        width.reshape(vectors),
+        offset.reshape(vectors), height, second_offset.reshape(vectors), second_height, ratio, width.reshape(vectors)
     )
 
 

@@ -6,38 +6,24 @@ Axes: triples are ordered (x, y, z). Positions are voxel indices; voxel k covers
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import Literal, Protocol
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lfpiv_cli.arrays import Floats
+from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.grid import Grid
 
 # Where there is fluid, and vectors can be measured: between the walls of a channel, or in a round pipe.
 #
-# Axes: points and sides (x, y, z) in mm, arrays [z, y, x]. A kind of walls is a class with the methods of `Walls`.
+# Axes: points and sides (x, y, z) in mm, arrays [z, y, x]. The kinds of `Walls` have the same methods.
 
 
 # Pipes that are tilted further from x or y are other pipes than `RoundWall` knows.
 LARGEST_TILT_DEG = 5.0
-
-
-class Walls(Protocol):
-    """What bounds the fluid."""
-
-    def contain(self, points_mm: Floats) -> NDArray[np.bool_]:
-        """Return which points (..., 3) lie in the fluid or on its walls."""
-
-    def shares(self, centres_mm: Floats, sides_mm: Floats) -> Floats:
-        """Return the share (...) of boxes with sides (3,) about centres (..., 3) that lies in the fluid."""
-
-    def volumes_mm3(self, low_mm: Floats, high_mm: Floats) -> Floats:
-        """Return the volume (...) in the fluid of boxes from one corner (..., 3) to the other, 0 of empty ones."""
-
-    def points(self, low_mm: Floats, high_mm: Floats, step_mm: Floats) -> Floats:
-        """Return points (k, 3) on the walls that a box holds, at most a step (3,) apart."""
 
 
 @dataclass(frozen=True)
@@ -117,7 +103,9 @@ class RoundWall:
         first, second = (
             np.moveaxis((corner - middle)[..., self._across] / self.radius_mm, -1, 0) for corner in (low_mm, high)
         )
-        area = rectangle_in_circle(first[0], second[0], first[1], second[1]) * self.radius_mm**2
+        x0, y0, x1, y1 = *first, *second
+        corners = [_from_origin(x1, y1), _from_origin(x0, y0), _from_origin(x1, y0), _from_origin(x0, y1)]
+        area = np.maximum(corners[0] + corners[1] - corners[2] - corners[3], 0.0) * self.radius_mm**2
         return np.asarray(area * (high - low_mm)[..., self.along])
 
     def points(self, low_mm: Floats, high_mm: Floats, step_mm: Floats) -> Floats:
@@ -145,6 +133,9 @@ class RoundWall:
         return points
 
 
+Walls = ParallelWalls | RoundWall
+
+
 def inside(grid: Grid, walls: Walls) -> NDArray[np.bool_]:
     """Return the voxels (nz, ny, nx) whose centres lie in the fluid."""
     # plane by plane: the places of all voxels together take more memory than the volume
@@ -157,14 +148,8 @@ def spaced(low: float, high: float, step: float) -> Floats:
     return np.linspace(low, high, int(np.ceil((high - low) / step)) + 1)
 
 
-def rectangle_in_circle(x0: Floats, x1: Floats, y0: Floats, y1: Floats) -> Floats:
-    """Return the area (...) of rectangles, x0 <= x1 and y0 <= y1, inside the circle of radius 1 about the origin."""
-    corners = [_from_origin(x1, y1), _from_origin(x0, y0), _from_origin(x1, y0), _from_origin(x0, y1)]
-    return np.maximum(corners[0] + corners[1] - corners[2] - corners[3], 0.0)
-
-
 def _from_origin(x: Floats, y: Floats) -> Floats:
-    """Return the area inside the circle of rectangles from the origin to (x, y), with the sign of x y."""
+    """Return the area inside the circle of radius 1 of rectangles from the origin to (x, y), with the sign of x y."""
     width, height = np.minimum(np.abs(x), 1.0), np.minimum(np.abs(y), 1.0)
     # up to here the rectangle's upper side lies in the circle, then the circle bounds it
     bend = np.minimum(np.sqrt(1.0 - height**2), width)
@@ -182,38 +167,54 @@ Triple = tuple[int, int, int]
 ROUNDING = 1e-9
 
 
+# The standard deviation of a Gaussian weighting, in sizes of the window: at the middle of a face it is exp(-2). The
+# spread of its weights along an axis is 0.22 of the size, that of uniform ones 0.29.
+GAUSSIAN_SIGMA = 0.25
+
+
+def gaussian(offset: Floats) -> Floats:
+    """Return the weights of a Gaussian about a window's middle, 1 there; offsets are in sizes of the window."""
+    return np.asarray(np.exp(-0.5 * (offset / GAUSSIAN_SIGMA) ** 2))
+
+
+# How voxels count in what is summed over a window: the weight along one axis by the offset from the window's middle in
+# sizes of the window, -0.5 to 0.5. A voxel has the product of its three.
+WEIGHTINGS: dict[str, Callable[[Floats], Floats]] = {"uniform": np.ones_like, "gaussian": gaussian}
+
+
 @dataclass(frozen=True)
 class WindowLayout:
     """A regular arrangement of equal windows; window k along an axis covers voxels first + k step ... + size - 1.
 
-    Windows may overhang the volume: `first` is then negative.
+    Windows may overhang the volume: `first` is then negative. Their voxels count by a `weighting` of `WEIGHTINGS`.
     """
 
     size: Triple
     step: Triple
     count: Triple
     first: Triple
+    weighting: str = "uniform"
 
     @property
-    def count_zyx(self) -> Triple:
-        """Shape of an array with one element per window."""
-        nx, ny, nz = self.count
-        return nz, ny, nx
+    def is_weighted(self) -> bool:
+        """Whether voxels of a window count differently."""
+        return self.weighting != "uniform"
 
-    def centres_voxel(self, axis: int) -> NDArray[np.float64]:
+    def weights(self, axis: int) -> Floats:
+        """Return the weights (size,) of a window's voxels along axis 0 (x), 1 (y) or 2 (z)."""
+        size = self.size[axis]
+        return WEIGHTINGS[self.weighting]((np.arange(size) - 0.5 * (size - 1)) / size)
+
+    def centres_voxel(self, axis: int) -> Floats:
         """Return the window centres along axis 0 (x), 1 (y) or 2 (z) as (fractional) voxel indices."""
         first_centre = self.first[axis] + 0.5 * (self.size[axis] - 1)
         return first_centre + self.step[axis] * np.arange(self.count[axis], dtype=np.float64)
 
     def grid(self, volume: Grid) -> Grid:
         """Return the grid of the window centres, in mm, for windows in a volume on the grid `volume`."""
-        spacing = tuple(s * d for s, d in zip(self.step, volume.spacing_mm, strict=True))
-        origin = volume.voxel_to_mm(np.array([self.centres_voxel(axis)[0] for axis in range(3)]))
-        return Grid(
-            self.count,
-            (spacing[0], spacing[1], spacing[2]),
-            (float(origin[0]), float(origin[1]), float(origin[2])),
-        )
+        x, y, z = (s * d for s, d in zip(self.step, volume.spacing_mm, strict=True))
+        x0, y0, z0 = volume.voxel_to_mm(np.array([self.centres_voxel(axis)[0] for axis in range(3)])).tolist()
+        return Grid(self.count, (x, y, z), (x0, y0, z0))
 
 
 def layout_windows(shape_xyz: Triple, size_xyz: Triple, overlap: tuple[float, float, float]) -> WindowLayout:
@@ -229,17 +230,56 @@ def layout_windows(shape_xyz: Triple, size_xyz: Triple, overlap: tuple[float, fl
     overlap : share of a window that it has in common with the next one, 0 <= overlap < 1; the step is then rounded to
         whole voxels, or rounded down where so many windows would not fit
     """
-    axes = [_layout_axis(n, w, o) for n, w, o in zip(shape_xyz, size_xyz, overlap, strict=True)]
-    (sx, nx, fx), (sy, ny, fy), (sz, nz, fz) = axes
-    return WindowLayout(size_xyz, (sx, sy, sz), (nx, ny, nz), (fx, fy, fz))
+    steps, counts, firsts = [], [], []
+    for voxels, size, share in zip(shape_xyz, size_xyz, overlap, strict=True):
+        exact = size * (1.0 - share)
+        count = max(1, math.floor(voxels / exact + ROUNDING))
+        # Of whole voxels, and no more than leave all windows' cells inside the volume.
+        step = max(1, min(math.floor(exact + 0.5), voxels // count))
+        steps.append(step)
+        counts.append(count)
+        # Doubled, to stay in whole numbers; an odd remainder leaves its last voxel at the far end.
+        firsts.append(((voxels - count * step) + step - size) // 2)
+    return WindowLayout(size_xyz, triple(steps), triple(counts), triple(firsts))
 
 
-def _layout_axis(voxels: int, size: int, overlap: float) -> Triple:
-    """Return step, count and first voxel along one axis."""
-    exact = size * (1.0 - overlap)
-    count = max(1, math.floor(voxels / exact + ROUNDING))
-    # Of whole voxels, and no more than leave all windows' cells inside the volume.
-    step = max(1, min(math.floor(exact + 0.5), voxels // count))
-    # Doubled, to stay in whole numbers; an odd remainder leaves its last voxel at the far end.
-    twice_first = (voxels - count * step) + step - size
-    return step, count, twice_first // 2
+def triple(values: Iterable[int]) -> Triple:
+    """Return three numbers as a triple, which a tuple of any length is not for the type checker."""
+    x, y, z = values
+    return x, y, z
+
+
+@dataclass(frozen=True)
+class CorrelationSettings:
+    """How two volumes are correlated.
+
+    Attributes
+    ----------
+    windows : sizes of the interrogation windows in voxels along (x, y, z), coarse to fine; the last gives the vectors
+    overlap : share of a window in common with the next one along (x, y, z), 0 <= overlap < 1
+    dt_s : time from the first volume to the second, or None where it is not known
+    exponent : power of the intensities that is correlated, 0 < exponent <= 1, negative ones being zero where it is
+        below 1. In volumes of a solver that sharpens, as EM does, the brightest particles outweigh all others and are
+        narrower than a voxel: the root lets the others speak and makes peaks wide enough to be located. In volumes with
+        a noisy background it raises that, and harms.
+    weighting : how voxels count by their place in a window, of `WEIGHTINGS`
+    """
+
+    windows: Sequence[Triple]
+    overlap: tuple[float, float, float]
+    dt_s: float | None = None
+    exponent: float = 1.0
+    weighting: str = "uniform"
+
+    def layout(self, shape_xyz: Triple, size_xyz: Triple | None = None) -> WindowLayout:
+        """Return windows in a volume of so many voxels: those of a size, or the final ones, which give the vectors.
+
+        Raises
+        ------
+        ConfigError
+            The weighting is none of those that there are.
+        """
+        if self.weighting not in WEIGHTINGS:
+            raise ConfigError(f"the weighting of the windows is {self.weighting}; it must be one of {list(WEIGHTINGS)}")
+        layout = layout_windows(shape_xyz, size_xyz or self.windows[-1], self.overlap)
+        return replace(layout, weighting=self.weighting)

@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 from lfpiv_cli.arrays import Floats
 from lfpiv_cli.calibration.board_pose import BoardGeometry
 from lfpiv_cli.calibration.model import Channel, advised_move_mm, mid_plane_z_mm
-from lfpiv_cli.flow.correlation import CorrelationSettings, correlate
+from lfpiv_cli.flow.correlation import correlate
 from lfpiv_cli.flow.field import REJECTED
+from lfpiv_cli.flow.windows import CorrelationSettings
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.names import Refraction
 from lfpiv_cli.optics.camera import Camera, Lattice, refocused

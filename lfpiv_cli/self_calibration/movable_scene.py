@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.curved_space import CurvedSpace
@@ -35,9 +36,7 @@ from lfpiv_cli.particles.pencil import MEAN_SQUARE, lines_of
 STEPS = 5
 
 
-def moved_places(
-    points_mm: NDArray[np.float64], before: Faces, after: Faces, radius_mm: float
-) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+def moved_places(points_mm: Floats, before: Faces, after: Faces, radius_mm: float) -> tuple[Floats, NDArray[np.bool_]]:
     """Return where particles lie behind other faces, their rays being the same.
 
     Parameters
@@ -58,9 +57,7 @@ def moved_places(
     return np.where(seen[:, np.newaxis], places, points_mm), seen
 
 
-def place_changes(
-    points_mm: NDArray[np.float64], ahead: Faces, behind: Faces, here: Faces, radius_mm: float
-) -> NDArray[np.float64]:
+def place_changes(points_mm: Floats, ahead: Faces, behind: Faces, here: Faces, radius_mm: float) -> Floats:
     """Return how far (n, 3) places move, their rays being the same, from faces `behind` to `ahead`; first order."""
     _, moves, seen = _lines(points_mm, here, radius_mm)
     first, _, seen_ahead = _lines(points_mm, ahead, radius_mm)
@@ -71,15 +68,13 @@ def place_changes(
     return changes
 
 
-def _solved(moves: NDArray[np.float64], wanted: NDArray[np.float64]) -> NDArray[np.float64]:
+def _solved(moves: Floats, wanted: Floats) -> Floats:
     """Return the steps (n, 3) that change lines (n, 4) by what is wanted, as nearly as they can."""
     turned = np.swapaxes(moves, 1, 2)
     return np.asarray(np.linalg.solve(turned @ moves, turned @ wanted[:, :, np.newaxis])[..., 0])
 
 
-def _lines(
-    points_mm: NDArray[np.float64], faces: Faces, radius_mm: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
+def _lines(points_mm: Floats, faces: Faces, radius_mm: float) -> tuple[Floats, Floats, NDArray[np.bool_]]:
     """Return the straight lines of the slopes of points (n, 4), their derivatives (n, 4, 3), and which are seen.
 
     The lines are slopes in the lens's middle, and by how much these grow to the root of the mean square over its disc.
@@ -117,10 +112,10 @@ class MovableScene:
     space: CurvedSpace
     camera: Camera
     wall: Cylinder
-    pivot_mm: NDArray[np.float64]
-    along: NDArray[np.float64]
-    across: NDArray[np.float64]
-    away: NDArray[np.float64]
+    pivot_mm: Floats
+    along: Floats
+    across: Floats
+    away: Floats
 
     @classmethod
     def of(cls, space: CurvedSpace, camera: Camera) -> MovableScene:
@@ -155,13 +150,13 @@ class MovableScene:
         """How far beyond the wall particles are looked for."""
         return BEYOND_SHARE * self.wall.radius_mm
 
-    def motion(self, values: NDArray[np.float64]) -> RigidMotion:
+    def motion(self, values: Floats) -> RigidMotion:
         """Return the motion by unknowns (4,): mm across and away, rad towards across and away."""
         shift = values[ACROSS] * self.across + values[AWAY] * self.away
         turn = values[TILT_ACROSS] * self.away - values[TILT_AWAY] * self.across
         return RigidMotion(_vector(shift), _vector(turn), _vector(self.pivot_mm))
 
-    def moved(self, values: NDArray[np.float64]) -> CurvedSpace:
+    def moved(self, values: Floats) -> CurvedSpace:
         """Return the scene moved by unknowns (4,).
 
         Raises
@@ -170,23 +165,23 @@ class MovableScene:
         """
         return self.space.moved(self.motion(values))
 
-    def faces(self, values: NDArray[np.float64]) -> Faces:
+    def faces(self, values: Floats) -> Faces:
         """Return the faces moved by unknowns (4,), the fluid going on a little beyond its wall."""
         return self.moved(values).for_kernels(self.camera)._replace(beyond_mm=self.beyond_mm)
 
-    def frame(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+    def frame(self, values: Floats) -> Floats:
         """Return the directions along, across and away (3, 3) of the pipe moved by unknowns (4,)."""
         return self.motion(values).directions(np.stack([self.along, self.across, self.away]))
 
-    def about_axis(self, points_mm: NDArray[np.float64], values: NDArray[np.float64]) -> NDArray[np.float64]:
+    def about_axis(self, points_mm: Floats, values: Floats) -> Floats:
         """Return points (n, 3), world axes, in the moved pipe's frame (n, 3): along, across and away from the pivot."""
         return np.asarray((points_mm - self.motion(values).points(self.pivot_mm)) @ self.frame(values).T)
 
-    def on_axis(self, along_mm: NDArray[np.float64], values: NDArray[np.float64]) -> NDArray[np.float64]:
+    def on_axis(self, along_mm: Floats, values: Floats) -> Floats:
         """Return the points (n, 3), world axes, of the moved pipe's axis at places (n,) along it."""
         return self.motion(values).points(self.pivot_mm) + np.outer(along_mm, self.frame(values)[0])
 
 
-def _vector(values: NDArray[np.float64]) -> tuple[float, float, float]:
+def _vector(values: Floats) -> tuple[float, float, float]:
     x, y, z = values.tolist()
     return x, y, z

@@ -13,7 +13,6 @@ Axes: image axes, mm; see `view`. Particles are rows (x, y, z, light), images fl
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
-from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -21,6 +20,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csc_matrix
 from scipy.sparse.linalg import lsqr
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.particles.cells import rim_table
 from lfpiv_cli.particles.fitting import add_all, refine
 from lfpiv_cli.particles.least_squares import UNKNOWNS, lit_by, observation_of, respond_all, room_for
@@ -36,15 +36,15 @@ ROUNDS, SWEEPS = 4, 3
 UNEXPLAINED = 0.02
 # Least squares: the columns are good to a thousandth after some forty steps.
 LEAST_SQUARES_STEPS, LEAST_SQUARES_TOLERANCE = 50, 1e-4
-# Differences: shift as a share of the pitch, shares of aperture and particle radius, and distortion in stretch at the
-# sensor's corner.
-SHIFT_STEP, SHARE_STEP, STRETCH_STEP = 2.5e-3, 0.004, 1e-4
-# What the optics model itself gets wrong: on an image traced ray by ray by another program, true to 4e-5 of the pitch,
-# aperture, radius and distortion came out 0.05 %, 0.7 % and 8e-5 (of stretch at the corner) off.
-MODEL_SHARE_OF_PITCH, MODEL_SHARE_OF_APERTURE, MODEL_SHARE_OF_RADIUS, MODEL_STRETCH = 1e-4, 6e-4, 0.01, 1.5e-4
 # Of the scene in mm and rad: over a field of 10 mm both move light by a tenth of a pixel and less.
 SCENE_STEPS = (2e-3, 2e-3, 5e-4, 5e-4)
 MODEL_SCENE = (1e-3, 1e-3, 2e-4, 2e-4)
+# Differences: shift as a share of the pitch, shares of aperture and particle radius, and distortion in stretch at the
+# sensor's corner.
+STEPS = np.array([2.5e-3, 2.5e-3, 0.004, 0.004, 1e-4, *SCENE_STEPS])
+# What the optics model itself gets wrong, likewise: on an image traced ray by ray by another program, true to 4e-5 of
+# the pitch, aperture, radius and distortion came out 0.05 %, 0.7 % and 8e-5 (of stretch at the corner) off.
+MODEL_ERRORS = np.array([1e-4, 1e-4, 6e-4, 0.01, 1.5e-4, *MODEL_SCENE])
 # The camera's unknowns stand before those of the scene.
 OF_CAMERA = 5
 # Particles whose columns are made at a time.
@@ -76,22 +76,22 @@ class Nuisances:
     tilt_away_rad: float = 0.0
 
     @property
-    def values(self) -> NDArray[np.float64]:
+    def values(self) -> Floats:
         """Those of camera and particles as an array (5,), in the order of the attributes."""
         return self.whole[:OF_CAMERA]
 
     @property
-    def scene(self) -> NDArray[np.float64]:
+    def scene(self) -> Floats:
         """Those of a scene (4,)."""
         return self.whole[OF_CAMERA:]
 
     @property
-    def whole(self) -> NDArray[np.float64]:
+    def whole(self) -> Floats:
         """All of them as an array (9,), in the order of the attributes."""
         return np.array([getattr(self, field.name) for field in fields(self)])
 
     @classmethod
-    def of(cls, values: NDArray[np.float64]) -> Nuisances:
+    def of(cls, values: Floats) -> Nuisances:
         """Return them from an array in the order of the attributes."""
         return cls(*(float(value) for value in values))
 
@@ -133,13 +133,13 @@ class NuisanceFit:
     found: Nuisances
     sigma: Nuisances
     view: View
-    particles: NDArray[np.float64]
+    particles: Floats
 
 
 def fit_nuisances(
-    image: NDArray[np.float64],
+    image: Floats,
     view: View,
-    particles: NDArray[np.float64],
+    particles: Floats,
     noise: Noise,
     depths_mm: tuple[float, float],
     scene: MovableScene | None = None,
@@ -155,14 +155,40 @@ def fit_nuisances(
     scene : through whose faces the particles are seen, free as well; None: what is seen through is as it is
     start : what is known before; the particles explain the image with it
     """
-    model, known = _model_errors(view, scene), Nuisances() if start is None else start
+    by_waves = view.lines.table.shape[0] > 0
+    corner_mm = 0.5 * view.camera.pixel_mm * float(np.hypot(view.camera.columns, view.camera.rows))
+    radii = view.camera.aperture_radius_mm, view.particle_radius_mm
+    of_scene = np.full(4, 0.0 if scene is None else 1.0)
+    size = np.array([2.0 * view.half_x_mm, 2.0 * view.half_y_mm, *radii, 1.0, *of_scene])
+    over = np.array([1.0, 1.0, 1.0, 1.0, corner_mm**2, *np.ones(4)])
+    model, unit = MODEL_ERRORS * size / over, STEPS * size / over
+    if by_waves:
+        # Line responses are of one aperture.
+        unit[2] = 0.0
+    sought = np.flatnonzero(unit)
+    known = Nuisances() if start is None else start
     particles, total, sigma = particles.copy(), known.whole, model
     changed = known.applied(view, scene)
     for _ in range(ROUNDS):
         residual, weight = _refined(image, changed, particles, noise, depths_mm)
-        lit = image - residual > LIT_SIGMAS * noise.read_counts
-        unknowns = _Unknowns(view, scene, total, depths_mm)
-        step, sigma = _gauss_newton(unknowns, particles, residual, np.sqrt(weight), lit)
+        root, lit = np.sqrt(weight), image - residual > LIT_SIGMAS * noise.read_counts
+        own, free = _columns(changed, particles, root, entry_capacity(changed, *depths_mm)), []
+        for change in np.diag(unit)[sought]:
+            difference = np.zeros(residual.size)
+            for sign in (1.0, -1.0):
+                ahead = Nuisances.of(total + sign * change).applied(view, scene)
+                # Least squares would take long to free a scene's motion of what the particles' places make up for.
+                seen = particles if scene is None else _moved(particles, changed, ahead)
+                difference += sign * _light(ahead, seen, residual.size, depths_mm)
+            free.append(_freed(own, 0.5 * root * difference))
+        left, design = _freed(own, root * residual), np.stack(free, axis=1)
+        covariance = np.linalg.inv(design.T @ design)
+        # What neighbours leave unexplained is as large an error as noise: the scatter says how large.
+        scatter = float(left[lit] @ left[lit]) / max(1, int(lit.sum()))
+        step, sigma = np.zeros(unit.size), np.zeros(unit.size)
+        step[sought] = covariance @ (design.T @ left)
+        sigma[sought] = np.sqrt(np.diag(covariance) * max(scatter, 1.0))
+        step, sigma = step * unit, sigma * unit
         total = total + step
         before, changed = changed, Nuisances.of(total).applied(view, scene)
         if scene is not None:
@@ -170,56 +196,15 @@ def fit_nuisances(
         if np.all(np.abs(step) <= model):
             break
     found, error = Nuisances.of(total), Nuisances.of(np.hypot(sigma, model))
-    if view.lines.table.shape[0] > 0:
+    if by_waves:
         error = replace(error, aperture_radius_mm=float("nan"))
     _refined(image, changed, particles, noise, depths_mm)
     return NuisanceFit(found, error, changed, particles)
 
 
-class _Unknowns(NamedTuple):
-    """What is sought of a view: all of `Nuisances`, but those of a scene only where there is one."""
-
-    view: View
-    scene: MovableScene | None
-    values: NDArray[np.float64]
-    depths_mm: tuple[float, float]
-
-    @property
-    def steps(self) -> NDArray[np.float64]:
-        """The steps (9,) of the differences, 0 of what is not sought: line responses are of one aperture."""
-        shares = SHARE_STEP * np.array([self.view.camera.aperture_radius_mm, self.view.particle_radius_mm])
-        if self.view.lines.table.shape[0] > 0:
-            shares[0] = 0.0
-        shift = 2.0 * SHIFT_STEP * np.array([self.view.half_x_mm, self.view.half_y_mm])
-        scene = np.zeros(len(SCENE_STEPS)) if self.scene is None else np.array(SCENE_STEPS)
-        return np.array([*shift, *shares, STRETCH_STEP / _corner_mm(self.view) ** 2, *scene])
-
-    def with_change(self, change: NDArray[np.float64] | float) -> View:
-        """Return the view with the values, changed by (9,)."""
-        return Nuisances.of(self.values + change).applied(self.view, self.scene)
-
-
-def _model_errors(view: View, scene: MovableScene | None) -> NDArray[np.float64]:
-    """Return what the optics model gets wrong of the unknowns (9,)."""
-    return np.array(
-        [
-            2.0 * MODEL_SHARE_OF_PITCH * view.half_x_mm,
-            2.0 * MODEL_SHARE_OF_PITCH * view.half_y_mm,
-            MODEL_SHARE_OF_APERTURE * view.camera.aperture_radius_mm,
-            MODEL_SHARE_OF_RADIUS * view.particle_radius_mm,
-            MODEL_STRETCH / _corner_mm(view) ** 2,
-            *(np.zeros(len(MODEL_SCENE)) if scene is None else MODEL_SCENE),
-        ]
-    )
-
-
 def _refined(
-    image: NDArray[np.float64],
-    view: View,
-    particles: NDArray[np.float64],
-    noise: Noise,
-    depths_mm: tuple[float, float],
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    image: Floats, view: View, particles: Floats, noise: Noise, depths_mm: tuple[float, float]
+) -> tuple[Floats, Floats]:
     """Refine particles in place; return what they leave of the image, and the weights of its pixels."""
     residual = image - _light(view, particles, image.size, depths_mm)
     for _ in range(SWEEPS):
@@ -228,52 +213,20 @@ def _refined(
     return residual, noise.weights(image - residual, residual, UNEXPLAINED)
 
 
-def _light(
-    view: View, particles: NDArray[np.float64], pixels: int, depths_mm: tuple[float, float]
-) -> NDArray[np.float64]:
+def _light(view: View, particles: Floats, pixels: int, depths_mm: tuple[float, float]) -> Floats:
     """Return the light (pixels,) of all particles."""
     image = np.zeros(pixels)
     add_all(view, particles, 1.0, image, depths_mm)
     return image
 
 
-def _gauss_newton(
-    unknowns: _Unknowns,
-    particles: NDArray[np.float64],
-    residual: NDArray[np.float64],
-    root_weight: NDArray[np.float64],
-    lit: NDArray[np.bool_],
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the next step of the unknowns and their standard errors, (9,) each, 0 of what is not sought."""
-    view, depths, unit = unknowns.with_change(0.0), unknowns.depths_mm, unknowns.steps
-    own = _columns(view, particles, root_weight, entry_capacity(view, *depths))
-    sought, free = np.flatnonzero(unit), []
-    for step in np.diag(unit)[sought]:
-        difference = np.zeros(residual.size)
-        for sign in (1.0, -1.0):
-            changed = unknowns.with_change(sign * step)
-            # Least squares would take long to free a scene's motion of what the particles' places make up for.
-            seen = particles if unknowns.scene is None else _moved(particles, view, changed)
-            difference += sign * _light(changed, seen, residual.size, depths)
-        free.append(_freed(own, 0.5 * root_weight * difference))
-    left = _freed(own, root_weight * residual)
-    design = np.stack(free, axis=1)
-    covariance = np.linalg.inv(design.T @ design)
-    # What neighbours leave unexplained is as large an error as noise: the scatter says how large.
-    scatter = float(left[lit] @ left[lit]) / max(1, int(lit.sum()))
-    step, sigma = np.zeros(unit.size), np.zeros(unit.size)
-    step[sought] = covariance @ (design.T @ left)
-    sigma[sought] = np.sqrt(np.diag(covariance) * max(scatter, 1.0))
-    return step * unit, sigma * unit
-
-
-def _moved(particles: NDArray[np.float64], before: View, after: View) -> NDArray[np.float64]:
+def _moved(particles: Floats, before: View, after: View) -> Floats:
     """Return particles (n, 4) where they lie behind the faces of another view, their rays being the same."""
     places, _ = moved_places(particles[:, :3], before.faces, after.faces, before.camera.aperture_radius_mm)
     return np.column_stack([places, particles[:, 3]])
 
 
-def _freed(own: csc_matrix, column: NDArray[np.float64]) -> NDArray[np.float64]:
+def _freed(own: csc_matrix, column: Floats) -> Floats:
     """Return what of a column no particle can make up for."""
     solution = lsqr(
         own,
@@ -285,19 +238,12 @@ def _freed(own: csc_matrix, column: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(column - own @ solution, dtype=np.float64)
 
 
-def _corner_mm(view: View) -> float:
-    """Return how far the sensor's corner is from the axis."""
-    return 0.5 * view.camera.pixel_mm * float(np.hypot(view.camera.columns, view.camera.rows))
-
-
-def _columns(view: View, particles: NDArray[np.float64], root_weight: NDArray[np.float64], capacity: int) -> csc_matrix:
+def _columns(view: View, particles: Floats, root_weight: Floats, capacity: int) -> csc_matrix:
     """Return the weighted derivatives by x, y, z and light of each particle, scaled to length 1, as sparse columns."""
 
-    def of(part: slice) -> tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.float32]]:
-        counts, pixels, values = _entries(view, particles[part], capacity)
-        return counts, *_scaled(counts, pixels, values, root_weight)
-
-    parts = in_threads(of, blocks(len(particles), BLOCK))
+    parts = in_threads(
+        lambda part: _entries(view, particles[part], root_weight, capacity), blocks(len(particles), BLOCK)
+    )
     counts, rows, data = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
     starts = np.concatenate([[0], np.cumsum(np.repeat(counts, UNKNOWNS))])
     return csc_matrix((data, rows, starts), shape=(root_weight.size, UNKNOWNS * len(particles)))
@@ -305,43 +251,24 @@ def _columns(view: View, particles: NDArray[np.float64], root_weight: NDArray[np
 
 @njit(cache=True, nogil=True)
 def _entries(
-    view: View, particles: NDArray[np.float64], capacity: int
-) -> tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.float64]]:
-    """Return of particles (n, 4) how many pixels each lights, which, and the values (pixels, 4) of unit light."""
-    counts, end = np.zeros(len(particles), np.int64), 0
-    pixels, values = np.empty(len(particles) * capacity, np.int32), np.empty((len(particles) * capacity, UNKNOWNS))
+    view: View, particles: Floats, root_weight: Floats, capacity: int
+) -> tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.float32]]:
+    """Return of particles (n, 4) how many pixels each lights, and rows and values of their columns."""
+    counts, at = np.zeros(len(particles), np.int64), 0
+    size = UNKNOWNS * len(particles) * capacity
+    data, rows = np.empty(size, np.float32), np.empty(size, np.int32)
     responses = room_for(1, capacity, 0)
     for n in range(len(particles)):
         respond_all(view, particles[n : n + 1], responses)
         lit, light = lit_by(responses, 0)
         counts[n] = lit.size
-        for k in range(lit.size):
-            pixels[end + k] = lit[k]
-            for m in range(UNKNOWNS):
-                values[end + k, m] = light[m, k]
-        end += lit.size
-    return counts, pixels[:end].copy(), values[:end].copy()
-
-
-@njit(cache=True, nogil=True)
-def _scaled(
-    counts: NDArray[np.int64],
-    pixels: NDArray[np.int32],
-    values: NDArray[np.float64],
-    root_weight: NDArray[np.float64],
-) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
-    """Return rows and values of the columns of some particles, from their entries."""
-    data, rows = np.empty(UNKNOWNS * pixels.size, np.float32), np.empty(UNKNOWNS * pixels.size, np.int32)
-    begin = at = 0
-    for count in counts:
         for k in range(UNKNOWNS):
             length2 = 0.0
-            for entry in range(begin, begin + count):
-                length2 += (root_weight[pixels[entry]] * values[entry, k]) ** 2
+            for entry in range(lit.size):
+                length2 += (root_weight[lit[entry]] * light[k, entry]) ** 2
             scale = 1.0 / np.sqrt(length2) if length2 > 0.0 else 0.0
-            for entry in range(begin, begin + count):
-                rows[at] = pixels[entry]
-                data[at] = scale * root_weight[pixels[entry]] * values[entry, k]
+            for entry in range(lit.size):
+                rows[at] = lit[entry]
+                data[at] = scale * root_weight[lit[entry]] * light[k, entry]
                 at += 1
-        begin += count
-    return rows, data
+    return counts, rows[:at].copy(), data[:at].copy()

@@ -16,19 +16,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.calibration.model import Calibration, known
 from lfpiv_cli.calibration.wave_shapes import WaveLight
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.camera import Camera
-from lfpiv_cli.optics.media import Media
 from lfpiv_cli.optics.tracing import ObjectSpace
 from lfpiv_cli.particles.diameter import UNKNOWN_LENSES, diameter_by
 from lfpiv_cli.particles.refraction import places_by_snell
 from lfpiv_cli.particles.rounds import ROUNDS, find_particles
-from lfpiv_cli.particles.search import Particles, task_of
+from lfpiv_cli.particles.search import Particles, Task, task_of
 from lfpiv_cli.particles.view import Light, View, raw_view, with_radius
 from lfpiv_cli.reconstruction.equations import normalisers
-from lfpiv_cli.self_calibration.nuisances import Nuisances, fit_nuisances
+from lfpiv_cli.self_calibration.movable_scene import MovableScene
+from lfpiv_cli.self_calibration.nuisances import NuisanceFit, Nuisances, fit_nuisances
 from lfpiv_cli.self_calibration.walls import Walls, find_walls, refuse_few
 from lfpiv_cli.weights.build import default_padding, factorise
 from lfpiv_cli.weights.model import Weights
@@ -36,7 +37,7 @@ from lfpiv_cli.weights.model import Weights
 # What the images of particles tell of the camera, as figures.
 
 
-def shift_px(camera: Camera, change: Nuisances) -> NDArray[np.float64]:
+def shift_px(camera: Camera, change: Nuisances) -> Floats:
     """Return how far (2,) all lens images have moved since the white image, (columns, rows)."""
     shift = np.array([change.shift_x_mm, change.shift_y_mm])
     return np.asarray(shift * camera.micro_image_scale / camera.pixel_mm, dtype=np.float64)
@@ -91,7 +92,7 @@ class Refinement:
     walls: Walls
     nuisances: Nuisances
     nuisances_sigma: Nuisances
-    position_mm: NDArray[np.float64]
+    position_mm: Floats
     depths_mm: tuple[float, float]
     frames: int
     expected_z_mm: float | None
@@ -195,8 +196,11 @@ def refine_calibration(
     camera = calibration.camera(sheet)
     media = space.media
     given, scale = flow.particle_diameter_mm, camera.scale(media)
-    expected = 0.0 if calibration.mid_plane_z_mm is None else calibration.mid_plane_z_mm
-    grid = _deep_grid(flow.volume, expected, flow.width_mm, PLANES_APART * scale.depth_mm)
+    # A grid as wide as the volume, and deeper than the channel.
+    (columns, rows, _), (dx, dy, _), deep = flow.volume.shape_xyz, flow.volume.spacing_mm, PLANES_APART * scale.depth_mm
+    count = int(np.ceil(flow.width_mm * (1.0 + 2.0 * MARGIN_PER_WIDTH) / deep))
+    x, y = (0.5 * sum(flow.volume.bounds_mm(axis)) for axis in (0, 1))
+    grid = Grid.centred((columns, rows, count), (dx, dy, deep), (x, y, calibration.mid_plane_z_mm or 0.0))
     told = flow.light
     waves = None if told is None else Light(told.wavelength_mm, told.diffusion_px, grid.bounds_mm(2))
     view = raw_view(camera, media, 0.5 * (given or UNKNOWN_LENSES * scale.lens_mm), calibration, light=waves)
@@ -205,25 +209,21 @@ def refine_calibration(
     weights = Weights(grid, padding, operator, camera.column_axis, calibration)
     sums = normalisers(weights.padded)
 
-    def search(image: NDArray[np.float32], seen: View) -> Particles:
-        return find_particles(task_of(image, seen, weights, camera, sums), REFINING_ROUNDS, progress)
+    def task(image: NDArray[np.float32], seen: View) -> Task:
+        return task_of(image, seen, weights, camera, sums)
 
-    if given is None and (measured := diameter_by([task_of(images[0], view, weights, camera, sums)])):
+    if given is None and (measured := diameter_by([task(images[0], view)])):
         view = with_radius(view, 0.5 * scale.lens_mm * measured.lenses)
-    first = search(images[0], view)
-    refuse_few(len(first.position_mm))
-    rows = np.column_stack([camera.to_image_axes(first.position_mm), first.light_counts])
-    fit = fit_nuisances(images[0].astype(np.float64).ravel(), view, rows, first.noise, grid.bounds_mm(2))
-    if progress:
-        progress(1)
-    found = [replace(first, position_mm=camera.to_image_axes(fit.particles[:, :3]))]
-    found += [search(image, fit.view) for image in images[1:]]
+    fit, first = first_image(task(images[0], view), view, grid.bounds_mm(2), progress)
+    found = [first, *(find_particles(task(image, fit.view), REFINING_ROUNDS, progress) for image in images[1:])]
     position = np.concatenate([each.position_mm for each in found])
     variance = np.concatenate([each.covariance_mm2[:, 2, 2] for each in found])
     # A particle that hardly lights the sensor may have no depth that can be determined.
     known = np.isfinite(variance) & (variance > 0.0)
     behind_walls = view._replace(layers=space.layers(camera))
     position, sigma = places_by_snell(position[known], behind_walls), np.sqrt(variance[known])
+    lens = float(camera.lattice.pitch.max()) / abs(camera.magnification)
+    lens_depth = lens / camera.aperture_radius_mm * camera.focus_distance_mm / media.depth_ratio
     return Refinement(
         walls=find_walls(position, sigma, grid.bounds_mm(2), flow.width_mm, len(images)),
         nuisances=fit.found,
@@ -233,23 +233,29 @@ def refine_calibration(
         frames=len(images),
         expected_z_mm=calibration.mid_plane_z_mm,
         expected_sigma_mm=calibration.mid_plane_z_sigma_mm,
-        common_depth_mm=_common_depth_mm(camera, media),
+        common_depth_mm=COMMON_SHARE_OF_LENS_DEPTH * lens_depth,
         width_mm=flow.width_mm,
         particle_diameter_mm=2.0 * view.particle_radius_mm,
         camera=camera,
     )
 
 
-def _common_depth_mm(camera: Camera, media: Media) -> float:
-    """Return the standard error that the depths of all particles share."""
-    lens = float(camera.lattice.pitch.max()) / abs(camera.magnification)
-    lens_depth = lens / camera.aperture_radius_mm * camera.focus_distance_mm / media.depth_ratio
-    return COMMON_SHARE_OF_LENS_DEPTH * lens_depth
+def first_image(
+    task: Task,
+    view: View,
+    depths_mm: tuple[float, float],
+    progress: Callable[[int], None] | None,
+    scene: MovableScene | None = None,
+    start: Nuisances | None = None,
+) -> tuple[NuisanceFit, Particles]:
+    """Return what the first image tells of the camera, and of a scene, and its particles so seen.
 
-
-def _deep_grid(volume: Grid, middle_mm: float, width_mm: float, deep: float) -> Grid:
-    """Return a grid as wide as the volume and deeper than the channel, of planes `deep` mm apart."""
-    shape, spacing = volume.shape_xyz, volume.spacing_mm
-    count = int(np.ceil(width_mm * (1.0 + 2.0 * MARGIN_PER_WIDTH) / deep))
-    x, y = (0.5 * sum(volume.bounds_mm(axis)) for axis in (0, 1))
-    return Grid.centred((shape[0], shape[1], count), (spacing[0], spacing[1], deep), (x, y, middle_mm))
+    `view`, `scene`, `start` are those of `fit_nuisances`, with which the task's view was made.
+    """
+    found = find_particles(task, REFINING_ROUNDS, progress)
+    refuse_few(len(found.position_mm))
+    rows = np.column_stack([task.camera.to_image_axes(found.position_mm), found.light_counts])
+    fit = fit_nuisances(task.image, view, rows, found.noise, depths_mm, scene, start)
+    if progress:
+        progress(1)
+    return fit, replace(found, position_mm=task.camera.to_image_axes(fit.particles[:, :3]))

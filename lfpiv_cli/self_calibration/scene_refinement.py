@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.calibration.model import Calibration
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.grid import Grid
@@ -28,7 +29,7 @@ from lfpiv_cli.optics.curved_space import CurvedSpace
 from lfpiv_cli.optics.shapes import ScenePose
 from lfpiv_cli.particles.diameter import UNKNOWN_LENSES, diameter_by
 from lfpiv_cli.particles.rounds import find_particles
-from lfpiv_cli.particles.search import Particles, Task, task_of
+from lfpiv_cli.particles.search import Task, task_of
 from lfpiv_cli.particles.view import View, footprint_radius_mm, on_array_mm, raw_view, with_radius
 from lfpiv_cli.reconstruction.equations import normalisers
 from lfpiv_cli.self_calibration.movable_scene import (
@@ -40,9 +41,15 @@ from lfpiv_cli.self_calibration.movable_scene import (
     moved_places,
     place_changes,
 )
-from lfpiv_cli.self_calibration.nuisances import SCENE_STEPS, NuisanceFit, Nuisances, fit_nuisances
-from lfpiv_cli.self_calibration.refinement import PLANES_APART, REFINING_ROUNDS, camera_figures, shift_px
-from lfpiv_cli.self_calibration.walls import RING_FROM, RoundWallFit, find_round_wall, refuse_few
+from lfpiv_cli.self_calibration.nuisances import SCENE_STEPS, Nuisances
+from lfpiv_cli.self_calibration.refinement import (
+    PLANES_APART,
+    REFINING_ROUNDS,
+    camera_figures,
+    first_image,
+    shift_px,
+)
+from lfpiv_cli.self_calibration.walls import RING_FROM, RoundWallFit, find_round_wall
 from lfpiv_cli.weights.columns import operator_of
 from lfpiv_cli.weights.model import Weights
 from lfpiv_cli.weights.scene import curved_padding
@@ -80,14 +87,14 @@ class SceneRefinement:
     """
 
     scene: MovableScene
-    axis: NDArray[np.float64]
-    covariance: NDArray[np.float64]
-    by_wall: NDArray[np.float64]
-    by_wall_covariance: NDArray[np.float64]
+    axis: Floats
+    covariance: Floats
+    by_wall: Floats
+    by_wall_covariance: Floats
     wall: RoundWallFit
     nuisances: Nuisances
     nuisances_sigma: Nuisances
-    position_mm: NDArray[np.float64]
+    position_mm: Floats
     frames: int
     particles: int
     particle_diameter_mm: float
@@ -96,7 +103,8 @@ class SceneRefinement:
     @property
     def disagreement(self) -> float:
         """Chi-squared of the four differences between the scene by the wall and by the images."""
-        return disagreement(self.by_wall, self.by_wall_covariance, self.nuisances, self.nuisances_sigma)
+        off = self.by_wall - self.nuisances.scene
+        return float(off @ np.linalg.solve(self.by_wall_covariance + np.diag(self.nuisances_sigma.scene**2), off))
 
     @property
     def agree(self) -> bool:
@@ -151,7 +159,7 @@ class SceneRefinement:
         }
 
 
-def _told(name: str, axis: NDArray[np.float64], sigma: NDArray[np.float64]) -> dict[str, Any]:
+def _told(name: str, axis: Floats, sigma: Floats) -> dict[str, Any]:
     """Return the corrections of an axis (4,) and their standard errors, tilts in degrees."""
     tilt, tilt_sigma = (np.rad2deg(each[[TILT_ACROSS, TILT_AWAY]]).tolist() for each in (axis, sigma))
     return {
@@ -162,31 +170,9 @@ def _told(name: str, axis: NDArray[np.float64], sigma: NDArray[np.float64]) -> d
     }
 
 
-def _spread(directions: NDArray[np.float64], covariance: NDArray[np.float64]) -> NDArray[np.float64]:
+def _spread(directions: Floats, covariance: Floats) -> Floats:
     """Return the standard errors (3,) along the world axes of what is known along two directions (3, 2)."""
     return np.asarray(np.sqrt(np.diag(directions @ covariance @ directions.T)), dtype=np.float64)
-
-
-def disagreement(
-    by_wall: NDArray[np.float64], covariance: NDArray[np.float64], images: Nuisances, images_sigma: Nuisances
-) -> float:
-    """Return the chi-squared of the differences of two scenes."""
-    off = by_wall - images.scene
-    return float(off @ np.linalg.solve(covariance + np.diag(images_sigma.scene**2), off))
-
-
-@dataclass(frozen=True)
-class PipeFlow:
-    """What is known of a flow in a pipe.
-
-    Attributes
-    ----------
-    volume : says where along the pipe particles are looked for, and how fine
-    particle_diameter_mm : of the tracers; None: by their images
-    """
-
-    volume: Grid
-    particle_diameter_mm: float | None
 
 
 def refine_scene(
@@ -194,7 +180,8 @@ def refine_scene(
     calibration: Calibration,
     sheet: Camera,
     space: CurvedSpace,
-    flow: PipeFlow,
+    volume: Grid,
+    particle_diameter_mm: float | None,
     progress: Callable[[int], None] | None = None,
 ) -> SceneRefinement:
     """Find the particles of images and the pipe that they are in.
@@ -204,6 +191,8 @@ def refine_scene(
     images : (rows, columns) raw, dark and background taken off, counts
     sheet : camera as the data sheet has it
     space : what lies before the particles, by config and calibration
+    volume : says where along the pipe particles are looked for, and how fine
+    particle_diameter_mm : of the tracers; None: by their images
 
     Raises
     ------
@@ -214,12 +203,12 @@ def refine_scene(
     """
     camera = calibration.camera(sheet)
     scene = MovableScene.of(space, camera)
-    given, lens_mm = flow.particle_diameter_mm, camera.scale(space.media).lens_mm
+    given, lens_mm = particle_diameter_mm, camera.scale(space.media).lens_mm
     view = raw_view(camera, space.media, 0.5 * (given or UNKNOWN_LENSES * lens_mm), calibration, space)
     start = Nuisances()
     for number in range(SEARCHES):
         seen = start.applied(view, scene)
-        weights = _weights(scene, start.scene, flow.volume, calibration, seen)
+        weights = _weights(scene, start.scene, volume, calibration, seen)
         sums = normalisers(weights.padded)
 
         def task(image: NDArray[np.float32], seen: View, weights: Weights = weights, sums: Any = sums) -> Task:
@@ -228,7 +217,8 @@ def refine_scene(
         if number == 0 and given is None and (measured := diameter_by([task(images[0], seen)])):
             view = with_radius(view, 0.5 * lens_mm * measured.lenses)
             seen = start.applied(view, scene)
-        fit, first = _first(task(images[0], seen), view, scene, start, progress)
+        work = task(images[0], seen)
+        fit, first = first_image(work, view, work.depths_mm, progress, scene, start)
         moved = np.abs(fit.found.scene - start.scene)
         start = fit.found
         if np.all(moved[:2] < SETTLED_SHARE * scene.wall.radius_mm):
@@ -247,18 +237,12 @@ def refine_scene(
     axis, axis_covariance, wall, placed = wall_by_places(
         position[seen_wall], covariance[seen_wall], scene, start.scene, len(images)
     )
-    images_sigma = replace(
-        fit.sigma,
-        axis_across_mm=float(np.hypot(fit.sigma.axis_across_mm, NOT_NOISE_LENSES * lens_mm)),
-        axis_away_mm=float(np.hypot(fit.sigma.axis_away_mm, NOT_NOISE_LENSES * lens_mm)),
-    )
-    together, together_covariance = axis, axis_covariance
-    if disagreement(axis, axis_covariance, fit.found, images_sigma) < AGREEING_CHI2:
-        together, together_covariance = _together(axis, axis_covariance, fit.found.scene, images_sigma.scene)
-    return SceneRefinement(
+    across, away = np.hypot(fit.sigma.scene[:2], NOT_NOISE_LENSES * lens_mm).tolist()
+    images_sigma = replace(fit.sigma, axis_across_mm=across, axis_away_mm=away)
+    refinement = SceneRefinement(
         scene=scene,
-        axis=together,
-        covariance=together_covariance,
+        axis=axis,
+        covariance=axis_covariance,
         by_wall=axis,
         by_wall_covariance=axis_covariance,
         wall=wall,
@@ -270,15 +254,18 @@ def refine_scene(
         particle_diameter_mm=2.0 * view.particle_radius_mm,
         camera=camera,
     )
+    if not refinement.agree:
+        return refinement
+    # The mean of the two, weighed by what is known of them.
+    by_wall, by_images = np.linalg.inv(axis_covariance), np.diag(images_sigma.scene**-2)
+    covariance = np.asarray(np.linalg.inv(by_wall + by_images), dtype=np.float64)
+    together = covariance @ (by_wall @ axis + by_images @ fit.found.scene)
+    return replace(refinement, axis=together, covariance=covariance)
 
 
 def wall_by_places(
-    position_mm: NDArray[np.float64],
-    covariance_mm2: NDArray[np.float64],
-    scene: MovableScene,
-    start: NDArray[np.float64],
-    frames: int = 1,
-) -> tuple[NDArray[np.float64], NDArray[np.float64], RoundWallFit, NDArray[np.float64]]:
+    position_mm: Floats, covariance_mm2: Floats, scene: MovableScene, start: Floats, frames: int = 1
+) -> tuple[Floats, Floats, RoundWallFit, Floats]:
     """Return where the scene lies by the wall that particles end at: unknowns (4,), their covariance, wall and places.
 
     Parameters
@@ -310,9 +297,7 @@ def wall_by_places(
     return axis, covariance, wall, camera.to_image_axes(places)
 
 
-def _following(
-    places_mm: NDArray[np.float64], own_mm: NDArray[np.float64], scene: MovableScene, axis: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _following(places_mm: Floats, own_mm: Floats, scene: MovableScene, axis: Floats) -> Floats:
     """Return how far the wall that particles end at follows the scene: (4, 4), 0 where places stay as they are.
 
     Column j is the motion of the wall, by its unknowns, that unknown j of the scene takes along.
@@ -336,62 +321,24 @@ def _following(
     return follows
 
 
-def _together(
-    wall: NDArray[np.float64],
-    wall_covariance: NDArray[np.float64],
-    images: NDArray[np.float64],
-    images_sigma: NDArray[np.float64],
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the mean of two scenes, weighed by what is known of them, and its covariance."""
-    weights = np.linalg.inv(wall_covariance), np.diag(images_sigma**-2)
-    covariance = np.linalg.inv(weights[0] + weights[1])
-    return covariance @ (weights[0] @ wall + weights[1] @ images), np.asarray(covariance, dtype=np.float64)
-
-
-def _first(
-    task: Task,
-    view: View,
-    scene: MovableScene,
-    start: Nuisances,
-    progress: Callable[[int], None] | None,
-) -> tuple[NuisanceFit, Particles]:
-    """Return what the first image tells of camera and scene, and its particles so seen."""
-    found = find_particles(task, REFINING_ROUNDS, progress)
-    refuse_few(len(found.position_mm))
-    rows = np.column_stack([task.camera.to_image_axes(found.position_mm), found.light_counts])
-    fit = fit_nuisances(task.image, view, rows, found.noise, task.depths_mm, scene, start)
-    if progress:
-        progress(1)
-    return fit, replace(found, position_mm=task.camera.to_image_axes(fit.particles[:, :3]))
-
-
-def _weights(
-    scene: MovableScene, values: NDArray[np.float64], volume: Grid, calibration: Calibration, view: View
-) -> Weights:
+def _weights(scene: MovableScene, values: Floats, volume: Grid, calibration: Calibration, view: View) -> Weights:
     """Return the weights of a volume that holds the pipe's section, as long as the given one, behind a moved scene."""
     space, camera = scene.moved(values), scene.camera
     deep = PLANES_APART * view.scale.depth_mm
     middle = scene.motion(values).points(scene.pivot_mm)
     reach = scene.wall.radius_mm + scene.beyond_mm
-    shape, spacing, centre = [0, 0, 0], [*volume.spacing_mm[:2], deep], middle.tolist()
+    (dx, dy, _), centre, lengths = volume.spacing_mm, middle.tolist(), [2.0 * reach] * 3
     # Along the pipe the volume's own length, across it all of the section.
     along = int(np.argmax(np.abs(scene.along)))
-    for axis in range(3):
-        low, high = volume.bounds_mm(axis)
-        length = high - low if axis == along else 2.0 * reach
-        shape[axis] = max(1, int(np.ceil(length / spacing[axis])))
-        if axis == along:
-            centre[axis] = 0.5 * (low + high)
-    grid = Grid.centred(
-        (shape[0], shape[1], shape[2]), (spacing[0], spacing[1], deep), (centre[0], centre[1], centre[2])
-    )
+    low, high = volume.bounds_mm(along)
+    centre[along], lengths[along] = 0.5 * (low + high), high - low
+    nx, ny, nz = (max(1, int(np.ceil(length / step))) for length, step in zip(lengths, (dx, dy, deep), strict=True))
+    grid = Grid.centred((nx, ny, nz), (dx, dy, deep), (centre[0], centre[1], centre[2]))
     padding = curved_padding(camera, space, grid)
     return Weights(grid, padding, operator_of(camera, space, grid.padded(padding)), camera.column_axis, calibration)
 
 
-def _wall_in_view(
-    view: View, scene: MovableScene, values: NDArray[np.float64], position_mm: NDArray[np.float64]
-) -> NDArray[np.bool_]:
+def _wall_in_view(view: View, scene: MovableScene, values: Floats, position_mm: Floats) -> NDArray[np.bool_]:
     """Return of which particles (n,) the light of the wall behind them, seen from the axis, falls on the sensor."""
     own = scene.about_axis(position_mm, values)
     distance = np.maximum(np.hypot(own[:, 1], own[:, 2]), np.finfo(np.float64).tiny)

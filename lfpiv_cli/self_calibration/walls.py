@@ -14,10 +14,10 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.special import expit, ndtr
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.errors import InputError
 
 # Steps of the numerical slopes, in units of the parameters.
@@ -26,51 +26,42 @@ SLOPE_STEP = 1e-4
 # logarithm of the edges' blur per width or radius, and the logit of the strays' share.
 BLUR, STRAY = -2, -1
 
-LogLikelihood = Callable[[NDArray[np.float64]], NDArray[np.float64]]
+LogLikelihood = Callable[[Floats], Floats]
 """The logarithm (n,) of each particle's density, from packed parameters."""
 
 
 def most_likely(
-    best: NDArray[np.float64],
+    best: Floats,
     first: list[int],
     free: list[int],
     places: int,
     blurs: tuple[float, ...],
     log_likelihood: LogLikelihood,
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+) -> tuple[Floats, Floats]:
     """Return the packed parameters (n,) that make the particles of a flow most likely, and their covariance (n, n).
 
     The first ones are sought with edges of each blur, coarse to fine, then all that are free; the others are left as
     they are, and have no variance. The covariance is from the scatter of the single particles' slopes.
     """
-    for blur in blurs:
-        best[BLUR] = np.log(blur)
-        best = _improved(best, first, _units(best, places), log_likelihood)
-    best = _improved(best, free, _units(best, places), log_likelihood)
+    for blur, sought in [*((blur, first) for blur in blurs), (None, free)]:
+        if blur is not None:
+            best[BLUR] = np.log(blur)
+        unit = _units(best, places)[sought]
+
+        def cost(change: Floats, start: Floats = best, sought: list[int] = sought, unit: Floats = unit) -> float:
+            packed = start.copy()
+            packed[sought] += change * unit
+            return -float(np.mean(log_likelihood(packed)))
+
+        found, best = minimize(cost, np.zeros(len(sought)), method="BFGS"), best.copy()
+        best[sought] += found.x * unit
     step = SLOPE_STEP * np.where(np.isin(np.arange(len(best)), free), _units(best, places), 0.0)
     slopes = [(log_likelihood(best + change) - log_likelihood(best - change)) / 2.0 for change in np.diag(step)]
     design = np.stack(slopes, axis=1)
     return best, np.asarray(np.linalg.pinv(design.T @ design) * np.outer(step, step), dtype=np.float64)
 
 
-def _improved(
-    start: NDArray[np.float64], free: list[int], units: NDArray[np.float64], log_likelihood: LogLikelihood
-) -> NDArray[np.float64]:
-    """Return the parameters with the free ones made most likely."""
-    unit = units[free]
-
-    def cost(change: NDArray[np.float64]) -> float:
-        packed = start.copy()
-        packed[free] += change * unit
-        return -float(np.mean(log_likelihood(packed)))
-
-    found = minimize(cost, np.zeros(len(free)), method="BFGS")
-    best = start.copy()
-    best[free] += found.x * unit
-    return best
-
-
-def _units(packed: NDArray[np.float64], places: int) -> NDArray[np.float64]:
+def _units(packed: Floats, places: int) -> Floats:
     """Return by how much each packed parameter may change before the likelihood's slope does; so many are of places."""
     return np.array([float(np.exp(packed[BLUR]))] * places + [0.1] * (len(packed) - places - 2) + [0.3] * 2)
 
@@ -110,8 +101,8 @@ class Walls:
 
     middle_mm: float
     middle_sigma_mm: float
-    slope: NDArray[np.float64]
-    slope_sigma: NDArray[np.float64]
+    slope: Floats
+    slope_sigma: Floats
     width_mm: float
     width_sigma_mm: float
     linear: float
@@ -119,11 +110,11 @@ class Walls:
     blur_mm: float
     stray_share: float
 
-    def depth_from_middle(self, position_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+    def depth_from_middle(self, position_mm: Floats) -> Floats:
         """Return how far (n,) behind the mid plane positions (n, 3) lie."""
         return np.asarray(position_mm[:, 2] - position_mm[:, :2] @ self.slope - self.middle_mm, dtype=np.float64)
 
-    def density(self, depth_mm: NDArray[np.float64], searched_mm: float) -> NDArray[np.float64]:
+    def density(self, depth_mm: Floats, searched_mm: float) -> Floats:
         """Return the share of the particles per mm at depths (n,) behind the mid plane."""
         parameters = np.array([0.0, 0.5 * self.width_mm, 0.0, 0.0, self.linear, self.quadratic])
         edges = np.full(depth_mm.shape, self.blur_mm)
@@ -131,11 +122,7 @@ class Walls:
 
 
 def find_walls(
-    position_mm: NDArray[np.float64],
-    depth_sigma_mm: NDArray[np.float64],
-    depths_mm: tuple[float, float],
-    width_mm: float,
-    frames: int = 1,
+    position_mm: Floats, depth_sigma_mm: Floats, depths_mm: tuple[float, float], width_mm: float, frames: int = 1
 ) -> Walls:
     """Find the walls by maximum likelihood.
 
@@ -181,21 +168,6 @@ def find_walls(
         blur_mm=blur,
         stray_share=stray,
     )
-    _ensure_walls(walls, depths_mm, width_mm)
-    return walls
-
-
-def refuse_few(count: int) -> None:
-    """Raise where too few particles were found."""
-    if count < FEWEST_PARTICLES:
-        raise InputError(
-            f"only {count} particles were found; at least {FEWEST_PARTICLES} are needed to see where they end at the "
-            "walls"
-        )
-
-
-def _ensure_walls(walls: Walls, depths_mm: tuple[float, float], width_mm: float) -> None:
-    """Raise where what was found is not the channel."""
     near, far = (walls.middle_mm + side * 0.5 * walls.width_mm for side in (-1.0, 1.0))
     found = f"the particles end at z = {near:z.3f} and {far:z.3f} mm"
     margin = LIMIT_BLURS * walls.blur_mm
@@ -208,9 +180,19 @@ def _ensure_walls(walls: Walls, depths_mm: tuple[float, float], width_mm: float)
         raise InputError(
             f"{found}, {walls.width_mm:.3f} mm apart, and channel.width_mm is {width_mm:g}; is the whole depth seeded?"
         )
+    return walls
 
 
-def _unpacked(packed: NDArray[np.float64], width: float) -> tuple[NDArray[np.float64], float, float]:
+def refuse_few(count: int) -> None:
+    """Raise where too few particles were found."""
+    if count < FEWEST_PARTICLES:
+        raise InputError(
+            f"only {count} particles were found; at least {FEWEST_PARTICLES} are needed to see where they end at the "
+            "walls"
+        )
+
+
+def _unpacked(packed: Floats, width: float) -> tuple[Floats, float, float]:
     """Return middle, half width, slopes and seeding (6,), the blur in mm and the share of strays.
 
     Packed are the middle per width, the logarithms of width and blur per width, and the logit of the share.
@@ -221,13 +203,7 @@ def _unpacked(packed: NDArray[np.float64], width: float) -> tuple[NDArray[np.flo
     return parameters, width * float(np.exp(packed[BLUR])), float(expit(packed[STRAY]))
 
 
-def _log_likelihood(
-    packed: NDArray[np.float64],
-    position: NDArray[np.float64],
-    sigma: NDArray[np.float64],
-    searched: float,
-    width: float,
-) -> NDArray[np.float64]:
+def _log_likelihood(packed: Floats, position: Floats, sigma: Floats, searched: float, width: float) -> Floats:
     """Return the logarithm (n,) of each particle's density."""
     parameters, blur, stray = _unpacked(packed, width)
     depth = position[:, 2] - position[:, :2] @ parameters[[SLOPE_X, SLOPE_Y]] - parameters[MIDDLE]
@@ -235,13 +211,7 @@ def _log_likelihood(
     return np.log(_density(depth, parameters, np.sqrt(sigma**2 + blur**2 + least**2), stray, searched))
 
 
-def _density(
-    depth: NDArray[np.float64],
-    parameters: NDArray[np.float64],
-    edge: NDArray[np.float64],
-    stray: float,
-    searched: float,
-) -> NDArray[np.float64]:
+def _density(depth: Floats, parameters: Floats, edge: Floats, stray: float, searched: float) -> Floats:
     """Return the share of particles per mm at depths from the mid plane, seen with errors `edge`."""
     half = parameters[HALF]
     t = np.clip(depth / half, -1.0, 1.0)
@@ -295,38 +265,19 @@ class RoundWallFit:
     blur_mm : of the edge: the common part of the particles' errors
     stray_share : of particles that are spread over all that was searched
     particles : in the ring
-    place_mm : (n, 3) of these
     """
 
-    axis: NDArray[np.float64]
-    covariance: NDArray[np.float64]
+    axis: Floats
+    covariance: Floats
     radius_mm: float
     radius_sigma_mm: float
     blur_mm: float
     stray_share: float
-    place_mm: NDArray[np.float64]
-
-    @property
-    def particles(self) -> int:
-        """How many there are in the ring."""
-        return len(self.place_mm)
-
-    def distance_mm(self, place_mm: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return how far (n,) behind the wall, from the axis, places (n, 3) lie; negative inside."""
-        angle, radius = _polar(place_mm)
-        return np.asarray(radius - self.wall_mm(angle, place_mm[:, 0]), dtype=np.float64)
-
-    def wall_mm(self, angle: NDArray[np.float64], along_mm: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the wall's distance (n,) from the frame's axis at angles and places along it."""
-        return _wall(self.radius_mm, self.axis, angle, along_mm)
+    particles: int
 
 
 def find_round_wall(
-    place_mm: NDArray[np.float64],
-    sigma_mm: NDArray[np.float64],
-    radius_mm: float,
-    searched_mm: float,
-    frames: int = 1,
+    place_mm: Floats, sigma_mm: Floats, radius_mm: float, searched_mm: float, frames: int = 1
 ) -> RoundWallFit:
     """Find the wall by maximum likelihood.
 
@@ -343,7 +294,7 @@ def find_round_wall(
         There are too few particles near the wall, or they do not end at one of this radius, or do not tell its place.
     """
     inner = RING_FROM * radius_mm
-    _, distance = _polar(place_mm)
+    distance = np.hypot(place_mm[:, 1], place_mm[:, 2])
     ring = (distance > inner) & (distance < searched_mm)
     place, sigma = place_mm[ring], sigma_mm[ring]
     if len(place) < FEWEST_IN_RING:
@@ -379,7 +330,7 @@ def find_round_wall(
         radius_sigma_mm=radius * float(np.sqrt(covariance[RADIUS, RADIUS])),
         blur_mm=float(np.hypot(blur, least)),
         stray_share=stray,
-        place_mm=place,
+        particles=len(place),
     )
     _ensure_wall(found, radius_mm, searched_mm)
     return found
@@ -398,28 +349,13 @@ def _ensure_wall(found: RoundWallFit, radius_mm: float, searched_mm: float) -> N
         )
     if np.any(sigma > LARGEST_SIGMA_SHARE * radius_mm):
         raise InputError(
-            f"{len(found.place_mm)} particles near the pipe's wall tell where its axis lies to {sigma[0]:.3f} mm "
+            f"{found.particles} particles near the pipe's wall tell where its axis lies to {sigma[0]:.3f} mm "
             f"across and {sigma[1]:.3f} mm in depth, not to {LARGEST_SIGMA_SHARE * radius_mm:g} mm: more of the wall "
             "has to be in view, and seeded"
         )
 
 
-def _polar(place_mm: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the angles from across towards away (n,) of places (n, 3), and their distances from the axis (n,)."""
-    return np.arctan2(place_mm[:, 2], place_mm[:, 1]), np.hypot(place_mm[:, 1], place_mm[:, 2])
-
-
-def _wall(
-    radius: float, axis: NDArray[np.float64], angle: NDArray[np.float64], along: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Return the wall's distance (n,) from the frame's axis."""
-    across, away = axis[0] + axis[2] * along, axis[1] + axis[3] * along
-    return np.asarray(radius + across * np.cos(angle) + away * np.sin(angle), dtype=np.float64)
-
-
-def _unpacked_of_round_wall(
-    packed: NDArray[np.float64], nominal: float, span: float
-) -> tuple[NDArray[np.float64], float, float, float]:
+def _unpacked_of_round_wall(packed: Floats, nominal: float, span: float) -> tuple[Floats, float, float, float]:
     """Return the axis (4,), the radius and the blur in mm, and the share of strays."""
     axis = nominal * packed[:OF_AXIS] / np.array([1.0, 1.0, span, span])
     blur, strays = nominal * float(np.exp(packed[BLUR])), float(expit(packed[STRAY]))
@@ -427,19 +363,15 @@ def _unpacked_of_round_wall(
 
 
 def _log_likelihood_of_round_wall(
-    packed: NDArray[np.float64],
-    place: NDArray[np.float64],
-    sigma: NDArray[np.float64],
-    nominal: float,
-    searched: float,
-    span: float,
-) -> NDArray[np.float64]:
+    packed: Floats, place: Floats, sigma: Floats, nominal: float, searched: float, span: float
+) -> Floats:
     """Return the logarithm (n,) of each particle's density along its direction from the axis."""
     axis, radius, blur, stray = _unpacked_of_round_wall(packed, nominal, span)
-    angle, distance = _polar(place)
+    along, angle, distance = place[:, 0], np.arctan2(place[:, 2], place[:, 1]), np.hypot(place[:, 1], place[:, 2])
     inner = RING_FROM * nominal
     middle, half = 0.5 * (inner + nominal), 0.5 * (nominal - inner)
-    wall = _wall(radius, axis, angle, place[:, 0])
+    across, away = axis[0] + axis[2] * along, axis[1] + axis[3] * along
+    wall = radius + across * np.cos(angle) + away * np.sin(angle)
     change = packed[EVEN] + packed[COSINE] * np.cos(angle) + packed[SINE] * np.sin(angle)
     t, end = np.clip((distance - middle) / half, -1.0, 1.0), (wall - middle) / half
     seeding = np.maximum(1.0 + change * t, LEAST_DENSITY)

@@ -107,7 +107,11 @@ def light_ratio(
         return nothing
     log_a, log_b = np.log(first.value), np.log(second.value)
     ratio, stated = log_b[target] - log_a[owner], first.log_variance()[owner] + second.log_variance()[target]
-    every = (log_b - log_a[:, np.newaxis]).ravel() if len(log_a) * len(log_b) < 10**6 else _some(log_a, log_b)
+    others = log_b
+    if len(log_a) * len(log_b) >= 10**6:
+        # A hundred particles of the second frame, evenly through all.
+        others = np.sort(log_b)[np.linspace(0, len(log_b) - 1, 100).astype(np.int64)]
+    every = (others - log_a[:, np.newaxis]).ravel()
     reach = max(float(np.abs(every).max()), float(np.abs(ratio).max()))
     if reach <= 0.0:
         return nothing
@@ -117,28 +121,18 @@ def light_ratio(
         np.histogram(every, edges)[0].astype(np.float64), max(SMOOTHING * every.std() / width, 1.0)
     )
     by_chance = (by_chance + 1.0) / np.sum(by_chance + 1.0) / width
-    peak, held, gain = _peak(middle, by_chance, *_histogram(ratio, stated, edges), len(first.value))
+    # The ratios counted by classes of the stated variance, and the mean variance of each.
+    number = np.searchsorted(np.quantile(stated, np.arange(1, CLASSES) / CLASSES), stated)
+    size = np.bincount(number, minlength=CLASSES)
+    of_class = (np.bincount(number, stated, CLASSES) / np.maximum(size, 1))[size > 0]
+    bins = np.clip(np.searchsorted(edges, ratio, side="right") - 1, 0, RATIO_BINS - 1)
+    counts = np.bincount(number * RATIO_BINS + bins, minlength=CLASSES * RATIO_BINS).reshape(CLASSES, -1)[size > 0]
+    peak, held, gain = _peak(middle, by_chance, counts.astype(np.float64), of_class, len(first.value))
     usual = float(np.median(np.sqrt(peak.variance(stated))))
     if held < LEAST_SHARE * min(len(log_a), len(log_b)) or usual > WIDEST_SHARE * every.std() or gain < LEAST_GAIN:
         return nothing
     likely = peak.density(ratio, stated) / np.interp(ratio, middle, by_chance)
     return np.asarray((1.0 - ASTRAY) * likely + ASTRAY)
-
-
-def _some(log_a: Floats, log_b: Floats) -> Floats:
-    """Return the ratios of a hundred particles of the second frame with each of the first, evenly through both."""
-    steps = np.linspace(0, len(log_b) - 1, 100).astype(np.int64)
-    return np.asarray((np.sort(log_b)[steps] - log_a[:, np.newaxis]).ravel())
-
-
-def _histogram(ratio: Floats, stated: Floats, edges: Floats) -> tuple[Floats, Floats]:
-    """Return the ratios counted by classes of the stated variance (classes, bins), and the mean variance of each."""
-    number = np.searchsorted(np.quantile(stated, np.arange(1, CLASSES) / CLASSES), stated)
-    size = np.bincount(number, minlength=CLASSES)
-    of_class = np.bincount(number, stated, CLASSES) / np.maximum(size, 1)
-    bins = np.clip(np.searchsorted(edges, ratio, side="right") - 1, 0, len(edges) - 2)
-    count = np.bincount(number * (len(edges) - 1) + bins, minlength=CLASSES * (len(edges) - 1))
-    return count.reshape(CLASSES, -1)[size > 0].astype(np.float64), of_class[size > 0]
 
 
 def _peak(
@@ -256,8 +250,6 @@ def candidates_of(first: Seen, second: Seen, middle_mm: Floats, reach_mm: Floats
 
 
 # Which particles of a sequence belong together, and where the tracks so made have been.
-#
-# Axes: places (n, 3) in mm of each frame.
 
 
 NO_TRACK = NO_PARTICLE = -1

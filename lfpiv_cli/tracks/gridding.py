@@ -20,12 +20,135 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import nnls
 from scipy.spatial import KDTree
 from scipy.special import chdtr, gammaincinv
 
 from lfpiv_cli.arrays import Floats
 from lfpiv_cli.robust import MAD_TO_SIGMA
-from lfpiv_cli.tracks.kriging import kriged, structure_of
+from lfpiv_cli.threads import blocks, in_threads
+
+# What scattered displacements let expect at other places, and how well: kriging with the flow's structure function.
+#
+# How unlike the displacements of two particles are depends on their distance: in turbulence their mean square
+# difference grows with its power of 2/3, in smooth flows with its square. The exponent, the factor and what is left at
+# no distance are taken from the displacements themselves; the best linear combination of neighbours about a linear
+# trend, and the variance of what it misses, follow. Each component is for itself, distances alike in all directions.
+
+
+# Neighbours whose differences show the structure function, and that let expect a displacement.
+PAIRED, USED = 12, 16
+# Distances are sorted into so many groups at most, of so many pairs at least.
+GROUPS, PAIRS_OF_GROUP = 8, 40
+# The largest first: where several fit alike, the flow is taken for smooth.
+EXPONENTS = np.arange(19, 3, -1) / 10.0
+# Where groups are too few to show an exponent.
+PLAIN_EXPONENT = 1.0
+# A linear trend takes four unknowns; with fewer neighbours than this they would be noise.
+FEWEST_OF_TREND = 12
+# The structure function is no smaller than this share of the noise: it keeps the equations solvable.
+SMALLEST_SHARE = 1e-6
+# Places that each thread works on at a time: its equations stay in the second-level cache, nearly.
+PLACES_AT_ONCE = 500
+
+
+class Structure(NamedTuple):
+    """Mean square difference of displacements over the distance r: nugget + factor r^exponent, mm^2.
+
+    Attributes
+    ----------
+    nugget, factor : (3,) of each component
+    exponent : common to all
+    """
+
+    nugget: Floats
+    factor: Floats
+    exponent: float
+
+    def at(self, distance_mm: float) -> Floats:
+        """Return the mean square difference (3,) that the flow makes over a distance, without what is left at none."""
+        return np.asarray(self.factor * distance_mm**self.exponent)
+
+
+def structure_of(points: Floats, displacement: Floats, noise2: Floats) -> Structure:
+    """Return the structure function of displacements (n, 3), two at least, whose variances are `noise2` (n, 3)."""
+    count = min(PAIRED, len(points) - 1)
+    distance, near = KDTree(points).query(points, k=np.arange(2, count + 2))
+    difference = (displacement[near] - displacement[:, np.newaxis]).reshape(-1, 3)
+    noise = (noise2[near] + noise2[:, np.newaxis]).reshape(-1, 3)
+    order = np.argsort(distance, axis=None, kind="stable")
+    groups = np.array_split(order, max(min(GROUPS, len(order) // PAIRS_OF_GROUP), 1))
+    apart = np.array([np.median(distance.ravel()[group]) for group in groups])
+    spread2 = np.array([(MAD_TO_SIGMA * np.median(np.abs(difference[group]), axis=0)) ** 2 for group in groups])
+    stated = np.array([np.median(noise[group], axis=0) for group in groups])
+    square = np.maximum(spread2 - stated, SMALLEST_SHARE * np.maximum(stated, np.finfo(np.float64).tiny))
+    if len(groups) < 3:
+        nearest = max(float(apart.mean()), np.finfo(np.float64).tiny)
+        return Structure(np.zeros(3), np.asarray(square.mean(axis=0) / nearest**PLAIN_EXPONENT), PLAIN_EXPONENT)
+    fits = []
+    for exponent in EXPONENTS:
+        # By relative errors.
+        terms = np.stack([np.ones_like(apart), apart**exponent], axis=1)
+        found = [nnls(terms / values[:, np.newaxis], np.ones(len(values))) for values in square.T]
+        nugget, factor = np.array([solution for solution, _ in found]).T
+        fits.append((float(sum(misfit for _, misfit in found)), Structure(nugget, factor, float(exponent))))
+    return min(fits, key=lambda fit: fit[0])[1]
+
+
+def kriged(
+    at: Floats, own: NDArray[np.int64], points: Floats, displacement: Floats, noise2: Floats, structure: Structure
+) -> tuple[Floats, Floats]:
+    """Return the displacements (m, 3) that neighbours let expect, and the variance (m, 3) of what they miss.
+
+    Parameters
+    ----------
+    at : (m, 3) places
+    own : (m,) which point is at a place and takes no part in what is expected there; -1: none
+    points, displacement, noise2 : (n, 3), two at least
+    """
+    count = min(USED, len(points) - 1)
+    tree = KDTree(points)
+    value, variance = np.empty(at.shape), np.empty(at.shape)
+
+    def work(part: slice) -> None:
+        """Solve the equations of universal kriging."""
+        here, each = at[part], np.arange(count)
+        near = without_own(tree.query(here, k=np.arange(1, count + 2))[1], own[part])
+        offset = points[near] - here[:, np.newaxis]
+        distance = np.linalg.norm(offset, axis=2)
+        apart = np.linalg.norm(offset[:, :, np.newaxis] - offset[:, np.newaxis], axis=3)
+        furthest = np.maximum(distance[:, -1:], np.finfo(np.float64).tiny)[..., np.newaxis]
+        trend = np.ones((*near.shape, 1))
+        if count >= FEWEST_OF_TREND:
+            trend = np.concatenate([trend, offset / furthest], axis=2)
+        terms = trend.shape[2]
+        apart, distance = apart**structure.exponent, distance**structure.exponent
+        for axis in range(3):
+            half = 0.5 * structure.factor[axis]
+            between, to = half * apart, half * distance
+            noise = noise2[near, axis] + 0.5 * structure.nugget[axis]
+            matrix = np.zeros((len(here), count + terms, count + terms))
+            matrix[:, :count, :count] = -between
+            matrix[:, each, each] += noise
+            matrix[:, :count, count:] = trend
+            matrix[:, count:, :count] = trend.swapaxes(1, 2)
+            right = np.concatenate([-to, np.ones((len(here), 1)), np.zeros((len(here), terms - 1))], axis=1)
+            weight = np.linalg.solve(matrix, right[..., np.newaxis])[:, :count, 0]
+            value[part, axis] = np.sum(weight * displacement[near, axis], axis=1)
+            missed = 2.0 * np.sum(weight * to, axis=1) - np.einsum("mi,mij,mj->m", weight, between, weight)
+            variance[part, axis] = np.maximum(missed, 0.0) + np.sum(weight**2 * noise, axis=1)
+
+    in_threads(work, blocks(len(at), PLACES_AT_ONCE))
+    return value, variance
+
+
+def without_own(near: NDArray[np.int64], own: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return all but one of the numbers of each row: its own, or else the last."""
+    is_own = near == own[:, np.newaxis]
+    drop = np.where(is_own.any(axis=1), is_own.argmax(axis=1), near.shape[1] - 1)
+    kept = np.arange(near.shape[1]) != drop[:, np.newaxis]
+    return near[kept].reshape(len(near), -1)
+
 
 # Robust polynomials through the tracks around many places at once.
 #
@@ -78,44 +201,40 @@ def fit_around(offset_mm: Floats, values: Floats, sigma: Floats, degree: int) ->
     """
     distance = np.linalg.norm(offset_mm, axis=2)
     radius = np.where(distance[:, -1:] > 0.0, distance[:, -1:], 1.0)
-    terms = _terms(offset_mm / radius[..., np.newaxis], degree)
-    kernel = np.exp(-0.5 * (distance / (KERNEL_WIDTH * radius)) ** 2)
-    each = [
-        _fit_component(terms, values[..., axis], np.maximum(sigma[..., axis], SMALLEST_SIGMA_SHARE * radius), kernel)
-        for axis in range(3)
-    ]
-    value, weights, scatter2 = (np.stack(parts, axis=1) for parts in zip(*each, strict=True))
-    return LocalFits(value, weights, scatter2, radius[:, 0])
-
-
-def _terms(offset: Floats, degree: int) -> Floats:
-    """Return the monomials up to a degree of one or two, last axis, the constant first."""
-    x, y, z = np.moveaxis(offset, -1, 0)
-    terms = [np.ones_like(x), x, y, z]
+    # The monomials, the constant first.
+    x, y, z = np.moveaxis(offset_mm / radius[..., np.newaxis], -1, 0)
+    monomials = [np.ones_like(x), x, y, z]
     if degree == 2:
-        terms += [x * x, y * y, z * z, x * y, x * z, y * z]
-    return np.stack(terms, axis=-1)
-
-
-def _fit_component(terms: Floats, values: Floats, sigma: Floats, kernel: Floats) -> tuple[Floats, Floats, Floats]:
-    """Return value (m,), weights (m, k) and scatter2 (m,) of one component, whose arrays are (m, k)."""
-    robust = np.ones_like(values)
-    for number in range(CAUCHY_ROUNDS + TUKEY_ROUNDS):
-        weighted, matrix = _equations(terms, kernel * robust / sigma**2)
-        coefficients = np.linalg.solve(matrix, weighted @ values[..., np.newaxis])
-        off = np.abs(values - (terms @ coefficients)[..., 0]) / sigma
-        spread = np.maximum(MAD_TO_SIGMA * np.median(off, axis=1, keepdims=True), SMALLEST_SPREAD)
-        if number < CAUCHY_ROUNDS:
-            robust = 1.0 / (1.0 + (off / spread) ** 2)
-        else:
-            robust = np.clip(1.0 - (off / (TUKEY * spread)) ** 2, 0.0, None) ** 2
-    weighted, matrix = _equations(terms, kernel * robust / sigma**2)
-    inverse = np.linalg.inv(matrix)
-    left = TUKEY_VARIANCE * _left_by_fit(terms @ inverse, weighted, sigma)
-    expected = np.maximum(np.sum(kernel * robust * left, axis=1), SMALLEST_SPREAD)
-    scatter2 = np.asarray(np.sum(kernel * robust * off**2, axis=1) / expected)
-    weights = np.asarray((inverse[:, :1] @ weighted)[:, 0] * sigma)
-    return np.asarray(coefficients[:, 0, 0]), weights, scatter2
+        monomials += [x * x, y * y, z * z, x * y, x * z, y * z]
+    terms = np.stack(monomials, axis=-1)
+    kernel = np.exp(-0.5 * (distance / (KERNEL_WIDTH * radius)) ** 2)
+    value, weights, scatter2 = [], [], []
+    for axis in range(3):
+        wanted, error = values[..., axis], np.maximum(sigma[..., axis], SMALLEST_SIGMA_SHARE * radius)
+        robust = np.ones_like(wanted)
+        for number in range(CAUCHY_ROUNDS + TUKEY_ROUNDS):
+            weighted, matrix = _equations(terms, kernel * robust / error**2)
+            coefficients = np.linalg.solve(matrix, weighted @ wanted[..., np.newaxis])
+            off = np.abs(wanted - (terms @ coefficients)[..., 0]) / error
+            spread = np.maximum(MAD_TO_SIGMA * np.median(off, axis=1, keepdims=True), SMALLEST_SPREAD)
+            if number < CAUCHY_ROUNDS:
+                robust = 1.0 / (1.0 + (off / spread) ** 2)
+            else:
+                robust = np.clip(1.0 - (off / (TUKEY * spread)) ** 2, 0.0, None) ** 2
+        weighted, matrix = _equations(terms, kernel * robust / error**2)
+        inverse = np.linalg.inv(matrix)
+        # The share of each track's variance that a fit leaves in its residual: the kernel lets the tracks next to a
+        # place draw the polynomial to them, where their number alone says little.
+        solved = terms @ inverse
+        own = np.einsum("mkp,mpk->mk", solved, weighted)
+        noise = (weighted * error[:, np.newaxis] ** 2) @ weighted.swapaxes(1, 2)
+        from_all = np.einsum("mkp,mkp->mk", solved @ noise, solved) / error**2
+        left = TUKEY_VARIANCE * (1.0 - 2.0 * own + from_all)
+        expected = np.maximum(np.sum(kernel * robust * left, axis=1), SMALLEST_SPREAD)
+        scatter2.append(np.sum(kernel * robust * off**2, axis=1) / expected)
+        weights.append((inverse[:, :1] @ weighted)[:, 0] * error)
+        value.append(coefficients[:, 0, 0])
+    return LocalFits(np.stack(value, axis=1), np.stack(weights, axis=1), np.stack(scatter2, axis=1), radius[:, 0])
 
 
 def _equations(terms: Floats, weight: Floats) -> tuple[Floats, Floats]:
@@ -125,17 +244,6 @@ def _equations(terms: Floats, weight: Floats) -> tuple[Floats, Floats]:
     diagonal = np.arange(matrix.shape[1])
     matrix[:, diagonal, diagonal] += RIDGE * np.trace(matrix, axis1=1, axis2=2)[:, np.newaxis] / len(diagonal)
     return weighted, matrix
-
-
-def _left_by_fit(solved: Floats, weighted: Floats, sigma: Floats) -> Floats:
-    """Return the share (m, k) of each track's variance that a fit leaves in its residual, fit = solved @ weighted @ v.
-
-    The kernel lets the tracks next to a place draw the polynomial to them, where their number alone says little.
-    """
-    own = np.einsum("mkp,mpk->mk", solved, weighted)
-    noise = (weighted * sigma[:, np.newaxis] ** 2) @ weighted.swapaxes(1, 2)
-    from_all = np.einsum("mkp,mkp->mk", solved @ noise, solved) / sigma**2
-    return np.asarray(1.0 - 2.0 * own + from_all)
 
 
 # Degrees and numbers of tracks to choose from: three to ten tracks for each of ten unknowns, five to fifteen for each
@@ -256,21 +364,20 @@ def _by_kriging(
 def _candidates(offset_mm: Floats, values: Floats, sigma: Floats, choices: list[tuple[int, int]]) -> Choices:
     """Return what the choices say at nodes whose nearest tracks (m, k, 3) are given."""
     fits = [fit_around(offset_mm[:, :k], values[:, :k], sigma[:, :k], degree) for degree, k in choices]
+    reference, of_differences = fits[REFERENCE], []
+    for fit in fits:
+        # The two share their nearest tracks.
+        common = min(fit.weights.shape[2], reference.weights.shape[2])
+        difference = fit.weights[..., :common] - reference.weights[..., :common]
+        rest = [np.sum(each.weights[..., common:] ** 2, axis=2) for each in (fit, reference)]
+        of_differences.append(np.sum(difference**2, axis=2) + rest[0] + rest[1])
     return Choices(
         value=np.stack([fit.value for fit in fits]),
         variance=np.stack([np.sum(fit.weights**2, axis=2) for fit in fits]),
-        difference_variance=np.stack([_difference_variance(fit, fits[REFERENCE]) for fit in fits]),
+        difference_variance=np.stack(of_differences),
         radius_mm=np.stack([fit.radius_mm for fit in fits]),
-        scatter2=fits[REFERENCE].scatter2,
+        scatter2=reference.scatter2,
     )
-
-
-def _difference_variance(fit: LocalFits, reference: LocalFits) -> Floats:
-    """Return the variance (m, 3) of the difference of two fits, which share their nearest tracks."""
-    common = min(fit.weights.shape[2], reference.weights.shape[2])
-    difference = fit.weights[..., :common] - reference.weights[..., :common]
-    rest = [np.sum(each.weights[..., common:] ** 2, axis=2) for each in (fit, reference)]
-    return np.asarray(np.sum(difference**2, axis=2) + rest[0] + rest[1])
 
 
 def _best(found: Choices, nodes_mm: Floats, choices: list[tuple[int, int]]) -> tuple[Floats, Floats]:
@@ -279,28 +386,24 @@ def _best(found: Choices, nodes_mm: Floats, choices: list[tuple[int, int]]) -> t
     scatter2 = np.median(found.scatter2[together], axis=1)
     error2 = found.variance * scatter2
     if len(choices) > 1:
-        error2 = error2 + _missed2(found, scatter2, together, choices)
+        # The mean square of what each fit misses of the flow around a node.
+        excess = np.stack(
+            [
+                _excess(value - found.value[REFERENCE], variance * scatter2, together)
+                for value, variance in zip(found.value, found.difference_variance, strict=True)
+            ]
+        )
+        missed = found.radius_mm[..., np.newaxis] ** MISSED_ORDER
+        growth = np.maximum(missed[WIDER] - missed[REFERENCE], np.finfo(np.float64).tiny)
+        of_parabolas = excess[WIDER] * (missed / growth) ** 2
+        is_parabola = np.array([degree == 2 for degree, _ in choices])[:, np.newaxis, np.newaxis]
+        error2 = error2 + np.where(is_parabola, of_parabolas, of_parabolas[REFERENCE] + excess)
         off = np.abs(found.value - np.median(found.value, axis=0))
         outlier = off > LARGEST_DEVIATION * np.sqrt(error2)
         error2 = np.where(outlier & ~outlier.all(axis=0), np.inf, error2)
     best = np.argmin(error2, axis=0)[np.newaxis]
     value, smallest = (np.take_along_axis(array, best, axis=0)[0] for array in (found.value, error2))
     return value, np.sqrt(smallest)
-
-
-def _missed2(found: Choices, scatter2: Floats, together: NDArray[np.int64], choices: list[tuple[int, int]]) -> Floats:
-    """Return the mean square (c, m, 3) of what each fit misses of the flow around a node."""
-    excess = np.stack(
-        [
-            _excess(value - found.value[REFERENCE], variance * scatter2, together)
-            for value, variance in zip(found.value, found.difference_variance, strict=True)
-        ]
-    )
-    missed = found.radius_mm[..., np.newaxis] ** MISSED_ORDER
-    growth = np.maximum(missed[WIDER] - missed[REFERENCE], np.finfo(np.float64).tiny)
-    of_parabolas = excess[WIDER] * (missed / growth) ** 2
-    is_parabola = np.array([degree == 2 for degree, _ in choices])[:, np.newaxis, np.newaxis]
-    return np.where(is_parabola, of_parabolas, of_parabolas[REFERENCE] + excess)
 
 
 def _excess(difference: Floats, noise2: Floats, together: NDArray[np.int64]) -> Floats:

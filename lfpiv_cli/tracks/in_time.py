@@ -29,8 +29,6 @@ from lfpiv_cli.tracks.candidates import NO_TRACK, Seen, Trajectories
 # each track's are drawn to zero as far as derivatives of that size are what noise makes. What is left out is alike
 # among neighbours, noise is not: a fit to many tracks lessens noise alone, so that derivatives are drawn to zero less
 # than would be best for one track.
-#
-# Axes: places (n, m, 3) in mm of n tracks in m frames, NaN where a track has none; times in frames.
 
 
 # 1, t, t^2/2, t^3/6, t^4/24; the first three are whatever the places say.
@@ -188,18 +186,15 @@ def _quartic(position_mm: Floats, covariance_mm2: Floats, time: Floats, variance
         for axis in range(3):
             matrix[:, term, axis, term, axis] += 1.0 / max(variance[row, axis], SMALLEST_OF_QUARTIC)
     size = 3 * QUARTIC
-    covariance = _inverse(matrix.reshape(-1, size, size))
+    matrix = matrix.reshape(-1, size, size)
+    # With ones on the diagonals in between.
+    scale = 1.0 / np.sqrt(np.diagonal(matrix, axis1=-2, axis2=-1))
+    both = scale[:, :, np.newaxis] * scale[:, np.newaxis]
+    covariance = np.linalg.inv(matrix * both) * both
     weighted = np.einsum("nmab,nmb->nma", weight, np.where(known[..., np.newaxis], position_mm, 0.0))
     right = np.einsum("mi,nma->nia", terms, weighted).reshape(-1, size)
     solution = np.einsum("nij,nj->ni", covariance, right)
     return solution.reshape(-1, QUARTIC, 3), covariance.reshape(-1, QUARTIC, 3, QUARTIC, 3)
-
-
-def _inverse(matrices: Floats) -> Floats:
-    """Return the inverses of positive definite matrices (n, k, k), with ones on the diagonals in between."""
-    scale = 1.0 / np.sqrt(np.diagonal(matrices, axis1=-2, axis2=-1))
-    both = scale[:, :, np.newaxis] * scale[:, np.newaxis]
-    return np.asarray(np.linalg.inv(matrices * both) * both)
 
 
 # 1, t, t^2/2, t^3/6, of which the first two are whatever the places say. A parabola has three unknowns, a cubic four;
@@ -271,21 +266,32 @@ def fit_in_time(position_mm: Floats, sigma_mm: Floats, time: Floats, scatter: Sc
     return State(solution[..., 0], solution[..., 1], error[..., 0], error[..., 1])
 
 
-def scatter_of(position_mm: Floats, sigma_mm: Floats, time: Floats) -> Scatter:
-    """Return noise and bending of tracks; the unknown ones where too few tracks are long enough."""
-    return scatter_of_pieces([(position_mm, sigma_mm)], time)
+def scatter_of(pieces: Iterable[tuple[Floats, Floats]], time: Floats) -> Scatter:
+    """Return noise and bending of tracks that come in pieces: of the places and errors of each but little is kept.
 
-
-def scatter_of_pieces(pieces: Iterable[tuple[Floats, Floats]], time: Floats) -> Scatter:
-    """Return noise and bending as `scatter_of` does, of tracks that come in pieces: of each but little is kept.
-
+    They are the unknown ones where too few tracks are long enough.
     Third derivatives are told by tracks of five places or more; where these are too few they are taken for those of
     circles with the velocities and the bendings that there are.
     """
-    told = [_derivatives_of(position, sigma, time - np.mean(time)) for position, sigma in pieces]
-    misfit = np.concatenate([each.misfit for each in told])
-    second, third = (np.concatenate([getattr(each, name) for each in told]) for name in ("second", "third"))
-    velocity = np.concatenate([each.velocity for each in told])
+    told: list[list[Floats]] = [[], [], [], []]
+    about = time - np.mean(time)
+    for places, errors in pieces:
+        count = np.isfinite(places[..., 0]).sum(axis=1)
+        # By cubics where these leave a residual, else by parabolas, which tell no third derivative.
+        for which, terms in ((count > CUBIC, CUBIC), ((count >= PARABOLA) & (count <= CUBIC), PARABOLA)):
+            position, sigma, freedom = places[which], errors[which], count[which] - terms
+            free = np.full((CUBIC - FREE_OF_CUBIC, 3), np.inf)
+            free[terms - FREE_OF_CUBIC :] = 0.0
+            solution, covariance = _cubic(position, sigma, about, free)
+            left = position - np.einsum("mi,nai->nma", _terms(about, CUBIC), solution)
+            squares = np.nansum((left / sigma) ** 2, axis=1)[freedom > 0]
+            # The median of chi-squared.
+            over = squares / (2.0 * gammaincinv(0.5 * freedom[freedom > 0], 0.5))[:, np.newaxis]
+            parts = [np.stack([solution[..., k], covariance[..., k, k]], axis=1) for k in (2, 3)]
+            third = parts[1][:0] if terms == PARABOLA else parts[1]
+            for kept, new in zip(told, (over, solution[..., 1].copy(), parts[0], third), strict=True):
+                kept.append(new)
+    misfit, velocity, second, third = (np.concatenate(each) for each in told)
     # Pieces go as soon as they are put together.
     del told
     if len(second) < FEWEST_TRACKS:
@@ -304,24 +310,6 @@ def scatter_of_pieces(pieces: Iterable[tuple[Floats, Floats]], time: Floats) -> 
     return Scatter(np.sqrt(noise2), bending, twisting, noise_known=noise_known, bending_known=True)
 
 
-@dataclass(frozen=True, eq=False)
-class _Derivatives:
-    """What tracks tell of noise and bending.
-
-    Attributes
-    ----------
-    misfit : (l, 3) squares of what fits leave over what stated errors let expect, of tracks with places to spare
-    velocity : (k, 3)
-    second : (k, 2, 3) second derivatives, and their variances
-    third : (j, 2, 3) third derivatives of the tracks with five places or more, and their variances
-    """
-
-    misfit: Floats
-    velocity: Floats
-    second: Floats
-    third: Floats
-
-
 def _variance(derivatives: Floats, noise2: Floats, shown: float = 0.0) -> Floats:
     """Return the variance (3,) of derivatives (n, 2, 3), given with their errors' variances, beyond these errors.
 
@@ -334,37 +322,12 @@ def _variance(derivatives: Floats, noise2: Floats, shown: float = 0.0) -> Floats
     return np.asarray(np.maximum(more, 0.0) * np.median(of_noise, axis=0))
 
 
-def _derivatives_of(position_mm: Floats, sigma_mm: Floats, time: Floats) -> _Derivatives:
-    """Return what the tracks tell that are long enough: by cubics where these leave a residual, else by parabolas."""
-    count = np.isfinite(position_mm[..., 0]).sum(axis=1)
-    misfit, velocity, second, third = [], [], [], []
-    for which, terms in ((count > CUBIC, CUBIC), ((count >= PARABOLA) & (count <= CUBIC), PARABOLA)):
-        position, sigma, freedom = position_mm[which], sigma_mm[which], count[which] - terms
-        free = np.full((CUBIC - FREE_OF_CUBIC, 3), np.inf)
-        free[terms - FREE_OF_CUBIC :] = 0.0
-        solution, covariance = _cubic(position, sigma, time, free)
-        left = position - np.einsum("mi,nai->nma", _terms(time, CUBIC), solution)
-        squares = np.nansum((left / sigma) ** 2, axis=1)[freedom > 0]
-        # The median of chi-squared.
-        misfit.append(squares / (2.0 * gammaincinv(0.5 * freedom[freedom > 0], 0.5))[:, np.newaxis])
-        velocity.append(solution[..., 1].copy())
-        parts = [np.stack([solution[..., k], covariance[..., k, k]], axis=1) for k in (2, 3)]
-        second.append(parts[0])
-        third.append(parts[1][:0] if terms == PARABOLA else parts[1])
-    return _Derivatives(*(np.concatenate(each) for each in (misfit, velocity, second, third)))
-
-
 def _terms(time: Floats, count: int) -> Floats:
     """Return 1, t, t^2/2, t^3/6 ..., (m, count)."""
     return np.stack([time**power / factorial(power) for power in range(count)], axis=1)
 
 
-def _cubic(
-    position_mm: Floats,
-    sigma_mm: Floats,
-    time: Floats,
-    expected: Floats,
-) -> tuple[Floats, Floats]:
+def _cubic(position_mm: Floats, sigma_mm: Floats, time: Floats, expected: Floats) -> tuple[Floats, Floats]:
     """Return the derivatives (n, 3, 4) of each component at time 0, and their covariances (n, 3, 4, 4).
 
     `expected` : (2, 3) variances of the second and third derivatives

@@ -15,11 +15,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.robust import MAD_TO_SIGMA
 from lfpiv_cli.scale import Scale
 from lfpiv_cli.tracks.candidates import NO_PARTICLE, NO_TRACK, Frames, Seen, Trajectories, long_ones, places, tracks_in
-from lfpiv_cli.tracks.in_time import FEWEST_TRACKS, Scatter, State, fit_in_time, scatter_of, scatter_of_pieces
-from lfpiv_cli.tracks.kriging import kriged, structure_of
+from lfpiv_cli.tracks.gridding import kriged, structure_of
+from lfpiv_cli.tracks.in_time import FEWEST_TRACKS, Scatter, State, fit_in_time, scatter_of
 from lfpiv_cli.tracks.tracking import NO_TRACKS, Forecast, Tracks, known_of, link_some, track
 
 # A forecast takes a track's last four places: enough for a parabola and to see its noise.
@@ -45,9 +46,9 @@ class Ahead:
     light_sigma : of the logarithm of a particle's light from frame to frame
     """
 
-    position_mm: NDArray[np.float64]
-    sigma_mm: NDArray[np.float64]
-    light: NDArray[np.float64]
+    position_mm: Floats
+    sigma_mm: Floats
+    light: Floats
     light_sigma: float
 
 
@@ -107,32 +108,34 @@ def followed_further(so_far: SoFar, frames: Frames, search_mm: float, scale: Sca
         (*so_far.found.probability, np.full(count, np.nan)),
     )
     start, end = frames[number], frames[number + 1]
-    forecast = _expected_displacements(so_far.ahead, start)
-    links = track(start, end, search_mm, scale, forecast)
+    ahead, own = so_far.ahead, slice(0, len(start))
+    known = np.isfinite(ahead.sigma_mm[own])
+    moved = ahead.position_mm[own] - start.position_mm + np.where(known, 0.0, np.nan)
+    links = track(start, end, search_mm, scale, Forecast(moved, ahead.sigma_mm[own]) if known.any() else None)
     found = _linked(found, number, number + 1, links)
     if number:
         earlier = _forecast(found, frames, number - 1, 2, so_far.scatter)
         found = _linked(found, number - 1, number + 1, _bridges(found, frames, number, earlier, search_mm, scale))
     window = _frames_before(number + 2, PAST_FRAMES)
     position, sigma = places(found, frames, window, tracks_in(found, window))
-    scatter = scatter_of(position, sigma, np.arange(len(window), dtype=np.float64))
+    scatter = scatter_of([(position, sigma)], np.arange(len(window), dtype=np.float64))
     past_factor, others_factor = (_surprise(start, end, links, each) for each in (so_far.by_past, so_far.by_others))
     by_past, by_others = _forecast(found, frames, number + 1, 1, scatter), _by_others(found, frames)
-    forecast = _blended(_widened(by_past, past_factor), by_others, others_factor)
+    # By both; where others are not known, the past is all there is.
+    forecast = past = _widened(by_past, past_factor)
+    if by_others is not None:
+        variance = (by_others.sigma_mm * (1.0 if others_factor is None else others_factor)) ** 2
+        forecast = Forecast(by_others.displacement_mm, np.sqrt(variance))
+        if past is not None:
+            past2 = past.sigma_mm**2
+            weight = np.where(np.isfinite(past2), variance / (variance + past2), 0.0)
+            off = np.nan_to_num(past.displacement_mm - by_others.displacement_mm)
+            forecast = Forecast(by_others.displacement_mm + weight * off, np.sqrt((1.0 - weight) * variance))
     over_two = _widened(_forecast(found, frames, number, 2, scatter), past_factor)
     return SoFar(found, scatter, by_past, by_others, _ahead(found, frames, forecast, over_two))
 
 
-def _expected_displacements(ahead: Ahead, frame: Seen) -> Forecast | None:
-    """Return what is ahead of a frame's particles as displacements; None where nothing is known."""
-    own = slice(0, len(frame))
-    if not np.isfinite(ahead.sigma_mm[own]).any():
-        return None
-    unknown = np.where(np.isfinite(ahead.sigma_mm[own]), 0.0, np.nan)
-    return Forecast(ahead.position_mm[own] - frame.position_mm + unknown, ahead.sigma_mm[own])
-
-
-def _surprise(first: Seen, second: Seen, links: Tracks, forecast: Forecast | None) -> NDArray[np.float64] | None:
+def _surprise(first: Seen, second: Seen, links: Tracks, forecast: Forecast | None) -> Floats | None:
     """Return how large errors (3,) of a forecast are over what is expected of them, at least 1; None: not known.
 
     Few frames know little of how tracks bend, and a parabola nothing of how their bending changes.
@@ -148,26 +151,11 @@ def _surprise(first: Seen, second: Seen, links: Tracks, forecast: Forecast | Non
     return np.maximum(MAD_TO_SIGMA * np.median(ratio, axis=0), 1.0)
 
 
-def _widened(forecast: Forecast | None, factor: NDArray[np.float64] | None) -> Forecast | None:
+def _widened(forecast: Forecast | None, factor: Floats | None) -> Forecast | None:
     """Return a forecast with so much larger errors; None where there is none, or its errors are not known."""
     if forecast is None or factor is None:
         return None
     return Forecast(forecast.displacement_mm, forecast.sigma_mm * factor)
-
-
-def _blended(
-    by_past: Forecast | None, by_others: Forecast | None, others_factor: NDArray[np.float64] | None
-) -> Forecast | None:
-    """Return the forecast by both; where others are not known, the past is all there is."""
-    if by_others is None:
-        return by_past
-    variance = (by_others.sigma_mm * (1.0 if others_factor is None else others_factor)) ** 2
-    if by_past is None:
-        return Forecast(by_others.displacement_mm, np.sqrt(variance))
-    past2 = by_past.sigma_mm**2
-    weight = np.where(np.isfinite(past2), variance / (variance + past2), 0.0)
-    off = np.nan_to_num(by_past.displacement_mm - by_others.displacement_mm)
-    return Forecast(by_others.displacement_mm + weight * off, np.sqrt((1.0 - weight) * variance))
 
 
 def _ahead(found: Trajectories, frames: Frames, forecast: Forecast | None, over_two: Forecast | None) -> Ahead:
@@ -190,7 +178,15 @@ def _ahead(found: Trajectories, frames: Frames, forecast: Forecast | None, over_
         at = np.concatenate([at, (frames[last - 1].position_mm + over_two.displacement_mm)[lost]])
         sigma = np.concatenate([sigma, over_two.sigma_mm[lost]])
         light = np.concatenate([light, frames[last - 1].light_value()[lost]])
-    return Ahead(at, sigma, light, _light_sigma(found, frames))
+    # The spread of the logarithm of a particle's light from frame to frame, by tracks through the last two.
+    numbers, light_sigma = (last - 1, last), 0.0
+    tracks = np.intersect1d(tracks_in(found, [numbers[0]]), tracks_in(found, [numbers[1]]))
+    earlier, now = (frames[k].light_value()[found.particles(k, tracks)] for k in numbers)
+    lit = (earlier > 0.0) & (now > 0.0)
+    if lit.any():
+        ratio = np.log(now[lit] / earlier[lit])
+        light_sigma = float(MAD_TO_SIGMA * np.median(np.abs(ratio - np.median(ratio))))
+    return Ahead(at, sigma, light, light_sigma)
 
 
 def _by_others(found: Trajectories, frames: Frames) -> Forecast | None:
@@ -210,32 +206,17 @@ def _by_others(found: Trajectories, frames: Frames) -> Forecast | None:
     return Forecast(displacement, np.sqrt(variance + np.median(noise2, axis=0) + 0.5 * structure.nugget))
 
 
-def _light_sigma(found: Trajectories, frames: Frames) -> float:
-    """Return the spread of the logarithm of a particle's light from frame to frame, by tracks through the last two."""
-    numbers = (len(found.labels) - 2, len(found.labels) - 1)
-    tracks = np.intersect1d(tracks_in(found, [numbers[0]]), tracks_in(found, [numbers[1]]))
-    if not len(tracks):
-        return 0.0
-    before, now = (frames[k].light_value()[found.particles(k, tracks)] for k in numbers)
-    lit = (before > 0.0) & (now > 0.0)
-    if not lit.any():
-        return 0.0
-    ratio = np.log(now[lit] / before[lit])
-    return float(MAD_TO_SIGMA * np.median(np.abs(ratio - np.median(ratio))))
-
-
 def scatter_in(found: Trajectories, frames: Sequence[Seen]) -> tuple[Scatter, int]:
     """Return noise and bending of the tracks of a sequence, and how many frames on either side of a time to take."""
-    wide, narrow = (_scatter_of_windows(found, frames, 2 * half + 1) for half in HALVES_FRAMES)
+    told = []
+    for width in (2 * half + 1 for half in HALVES_FRAMES):
+        # Windows of so many frames that do not overlap.
+        windows = [_frames_before(end, width) for end in range(min(width, len(frames)), len(frames) + 1, width)]
+        pieces = (places(found, frames, window, tracks_in(found, window)) for window in windows)
+        told.append(scatter_of(pieces, np.arange(len(windows[0]), dtype=np.float64)))
+    wide, narrow = told
     is_followed = np.all(wide.noise <= LARGEST_MISFIT * narrow.noise)
     return (wide, HALVES_FRAMES[0]) if is_followed else (narrow, HALVES_FRAMES[1])
-
-
-def _scatter_of_windows(found: Trajectories, frames: Sequence[Seen], width: int) -> Scatter:
-    """Return noise and bending of the tracks in windows of so many frames that do not overlap."""
-    windows = [_frames_before(end, width) for end in range(min(width, len(frames)), len(frames) + 1, width)]
-    pieces = (places(found, frames, window, tracks_in(found, window)) for window in windows)
-    return scatter_of_pieces(pieces, np.arange(len(windows[0]), dtype=np.float64))
 
 
 def states_at(
@@ -311,8 +292,6 @@ def _bridges(
 # Once a sequence has been followed, a frame is known from both sides: a particle that it has lost lies between two
 # places of its track, and one whose track begins or ends beside it lies on the way on. As a Kalman smoother does
 # after its filter, what comes later now counts as what came before.
-#
-# Axes: places (n, 3) in mm of each frame.
 
 
 # Frames on either side that are looked at: a cubic has a place or more to spare.
@@ -331,7 +310,7 @@ def expected_in(found: Trajectories, frames: Frames, number: int) -> Ahead:
     told = known.sum(axis=1) > 1
     tracks, position, sigma, known = tracks[told], position[told], sigma[told], known[told]
     time = np.array(window, dtype=np.float64) - number
-    state = fit_in_time(position, sigma, time, scatter_of(position, sigma, time))
+    state = fit_in_time(position, sigma, time, scatter_of([(position, sigma)], time))
     light = np.full(known.shape, np.nan)
     for column, frame in enumerate(window):
         there = known[:, column]

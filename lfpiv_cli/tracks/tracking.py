@@ -12,6 +12,7 @@ Axes: points (n, 3) in mm. Depth is known worse than the lateral place, so dista
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -23,7 +24,7 @@ from lfpiv_cli.robust import MAD_TO_SIGMA
 from lfpiv_cli.scale import Scale
 from lfpiv_cli.threads import share_out
 from lfpiv_cli.tracks.candidates import Candidates, Seen, candidates_of
-from lfpiv_cli.tracks.kriging import kriged, structure_of
+from lfpiv_cli.tracks.gridding import kriged, structure_of
 
 # The first guess of links: neighbours vote for displacements that resemble their own.
 #
@@ -205,8 +206,7 @@ class Known:
     variance_mm2: Floats
 
 
-@dataclass(frozen=True, eq=False)
-class Expected:
+class Expected(NamedTuple):
     """Displacements (n, 3) that are expected of particles, and the variances (n, 3) of what is missed, mm, mm^2."""
 
     displacement_mm: Floats
@@ -231,7 +231,17 @@ def track(first: Seen, second: Seen, search_mm: float, scale: Scale, forecast: F
     candidates = candidates_of(first, second, *_sought(first, second, search_mm, scale, forecast))
     density = density_per_mm3(first, second, search_mm)
     score = votes(first.position_mm, candidates, density, scale, of_equal_errors(scale))
-    links, share = _exclusive(candidates, score + _log_near(candidates, search_mm, forecast)), PARTNERED
+    # Short displacements, or those near a forecast, where nobody votes.
+    off = candidates.displacement_mm
+    if forecast is not None:
+        off = off - np.nan_to_num(forecast.displacement_mm)[candidates.first]
+    score = score + -0.5 * np.sum((off / search_mm) ** 2, axis=1)
+    # Each first particle's best pair, and of those that share a second one the best.
+    order = np.lexsort((-score, candidates.first))
+    best = order[np.unique(candidates.first[order], return_index=True)[1]]
+    best = best[np.isfinite(score[best])]
+    order = best[np.argsort(-score[best], kind="stable")]
+    links, share = np.sort(order[np.unique(candidates.second[order], return_index=True)[1]]), PARTNERED
     probability = np.zeros(len(candidates.first))
     for _ in range(ROUNDS):
         known = known_of(first, second, candidates.first[links], candidates.second[links], scale)
@@ -369,28 +379,12 @@ def _sought(
     return middle, reach
 
 
-def _log_near(candidates: Candidates, search_mm: float, forecast: Forecast | None) -> Floats:
-    """Return what is added to the votes (c,): short displacements, or those near a forecast, where nobody votes."""
-    off = candidates.displacement_mm
-    if forecast is not None:
-        off = off - np.nan_to_num(forecast.displacement_mm)[candidates.first]
-    return np.asarray(-0.5 * np.sum((off / search_mm) ** 2, axis=1))
-
-
-def _exclusive(candidates: Candidates, score: Floats) -> NDArray[np.int64]:
-    """Return each first particle's best pair, and of those that share a second one the best."""
-    order = np.lexsort((-score, candidates.first))
-    best = order[np.unique(candidates.first[order], return_index=True)[1]]
-    best = best[np.isfinite(score[best])]
-    order = best[np.argsort(-score[best], kind="stable")]
-    return np.sort(order[np.unique(candidates.second[order], return_index=True)[1]])
-
-
 def _calibrated(expected: Expected, known: Known) -> Expected:
     """Return what is expected with variances that the residuals of the known displacements bear out."""
     if len(known.number) < FEWEST_OF_FIT:
         return expected
-    off = known.displacement_mm - expected.displacement_mm[known.number]
-    ratio = np.abs(off) / np.sqrt(expected.variance_mm2[known.number])
+    displacement, variance = expected
+    off = known.displacement_mm - displacement[known.number]
+    ratio = np.abs(off) / np.sqrt(variance[known.number])
     factor = np.maximum(MAD_TO_SIGMA * np.median(ratio, axis=0), SMALLEST_FACTOR)
-    return Expected(expected.displacement_mm, expected.variance_mm2 * factor**2)
+    return Expected(displacement, variance * factor**2)

@@ -13,10 +13,9 @@ from scipy.ndimage import maximum_filter
 from lfpiv_cli.files.particle_file import PointRows
 from lfpiv_cli.files.provenance import calibrated_with
 from lfpiv_cli.files.vtkhdf import Volume
-from lfpiv_cli.flow.correlation import CorrelationSettings
 from lfpiv_cli.flow.field import MASKED, REJECTED, VALID, VectorField
-from lfpiv_cli.flow.maps import margins, valid_shares
-from lfpiv_cli.flow.windows import WindowLayout
+from lfpiv_cli.flow.sums import margins, valid_shares
+from lfpiv_cli.flow.windows import CorrelationSettings, WindowLayout
 from lfpiv_cli.notice import Notice, written
 from lfpiv_cli.robust import of_half_the_sum
 from lfpiv_cli.tracks.tracking import FEWEST_OF_FIT

@@ -30,6 +30,7 @@ from lfpiv_cli.files.provenance import (
     seconds_between,
     with_warnings,
 )
+from lfpiv_cli.files.sections_simulated import CorrelationKeys
 from lfpiv_cli.files.vtkhdf import Volume
 from lfpiv_cli.flow import correlation
 from lfpiv_cli.flow.correlation import correlate as measure
@@ -175,13 +176,12 @@ class Job:
 
 
 @dataclass(frozen=True, kw_only=True)
-class CorrelateOptions(PairBatchOptions):
-    """What `correlate` is given besides the volumes.
+class CorrelateOptions(CorrelationKeys, PairBatchOptions):
+    """What `correlate` is given besides the volumes, and keys in place of those of the config's section `correlation`.
 
     Attributes
     ----------
     config : in place of the one that the volumes carry
-    dt_s, windows, overlap : in place of the config's, see its section `correlation`
     mask_volume : volume on the same grid, 0 where the volumes are left out
     ensemble : one field of all pairs together
     derived : vorticity, divergence, strain rate and Q criterion, too
@@ -189,9 +189,6 @@ class CorrelateOptions(PairBatchOptions):
     """
 
     config: Path | None = None
-    dt_s: float | None = None
-    windows: Sequence[int | Sequence[int]] | None = None
-    overlap: float | Sequence[float] | None = None
     mask_volume: Path | None = None
     ensemble: bool = False
     derived: bool = False

@@ -17,6 +17,7 @@ from lfpiv_cli.fields import pressure
 from lfpiv_cli.fields.fit import SEED, Field, fit_field
 from lfpiv_cli.fields.samples import Samples
 from lfpiv_cli.fields.spline_field import SplineField
+from lfpiv_cli.fields.stencils import Lattice
 from lfpiv_cli.files import vtkhdf
 from lfpiv_cli.files.atomic import ensure_writable, write_text
 from lfpiv_cli.files.config import Config
@@ -199,7 +200,7 @@ def _on_windows(
     grid = WindowGrid(volume, windows, settings.overlap(volume.spacing_mm)).centres
     nodes = grid.centres_mm()
     everywhere = np.concatenate([samples.points_mm, nodes.reshape(-1, 3)])
-    lattice = pressure.lattice_over(everywhere.min(axis=0), everywhere.max(axis=0), knot_mm)
+    lattice = Lattice.affordable(everywhere.min(axis=0), everywhere.max(axis=0), knot_mm)
     field = pressure.pressure_field(samples, lattice, np.random.default_rng(SEED), wrong_share)
     found = field.value_at(nodes.reshape(-1, 3)).reshape(grid.shape_zyx)
     sigma = np.sqrt(field.variance_at(nodes.reshape(-1, 3))).reshape(grid.shape_zyx)

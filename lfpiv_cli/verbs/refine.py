@@ -30,7 +30,6 @@ from lfpiv_cli.self_calibration.scene_refinement import (
     AGREEING_CHI2,
     STEPS_OF_FIRST,
     STEPS_OF_OTHER,
-    PipeFlow,
     SceneRefinement,
     refine_scene,
 )
@@ -143,7 +142,8 @@ def _scene(
             before,
             settings.camera_model(),
             scene,
-            PipeFlow(settings.grid(), settings.reconstruction.particle_diameter_mm),
+            settings.grid(),
+            settings.reconstruction.particle_diameter_mm,
             advance,
         )
     if not found.agree:

@@ -1,4 +1,4 @@
-"""Symmetric normalised direct correlation of two volumes, window by window.
+"""What is summed over windows: the symmetric normalised direct correlation of two volumes, and their moments.
 
 For a window W and a shift s of whole voxels,
 
@@ -14,22 +14,27 @@ over blocks of that size once, and blocks into windows. Axes: everything here is
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from math import gcd
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
 from lfpiv_cli.arrays import Floats
-from lfpiv_cli.flow.windows import Triple, WindowLayout
+from lfpiv_cli.flow.windows import Triple, WindowLayout, triple
 from lfpiv_cli.robust import of_half_the_sum
-from lfpiv_cli.simd.block_sums import FEW_SHIFTS, MANY_SHIFTS, products
+from lfpiv_cli.simd.block_sums import FEW_SHIFTS, MANY_SHIFTS, MOMENTS, products
+from lfpiv_cli.simd.block_sums import moments as lane_moments
 from lfpiv_cli.simd.vectors import LANES
-from lfpiv_cli.threads import share_out
+from lfpiv_cli.threads import in_threads, share_out
 
 # Blocks narrower than this cost more in sums of sums than the products they save.
 SMALLEST_BLOCK = 4
+# Cells along an axis of a window, at least, where it has as many voxels: groups enough for a variance.
+CELLS_PER_WINDOW = 4
 # A window whose energy is below this share of the brightest one's is empty: what the splines carry into empty space
 # reaches amplitudes of 1e-5.
 SMALLEST_ENERGY = 1e-9
@@ -38,38 +43,46 @@ SMALLEST_ENERGY = 1e-9
 SMALLEST_AMPLITUDE = 0.07
 
 
-@dataclass(frozen=True)
-class Blocks:
-    """How the windows of one layout are made of blocks, along (z, y, x); along x each is a block of its own.
+Starts = tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]
+Weights = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]
 
-    Block k along an axis covers voxels first + k stride ... + size - 1; window k is the sum of blocks k hop ... k hop +
-    per_window - 1.
+
+@dataclass(frozen=True, eq=False)
+class Cells:
+    """How the windows of one layout are made of cells, along (z, y, x).
+
+    Cell k along an axis covers `size[k]` voxels from `start[k]` on, counted from the first window's first voxel; window
+    k is the sum of cells k hop ... k hop + per_window - 1.
     """
 
-    first: Triple
-    size: Triple
-    stride: Triple
-    count: Triple
+    start: Starts
+    size: Starts
     per_window: Triple
     hop: Triple
 
 
-def blocks_of(layout: WindowLayout) -> Blocks:
-    """Return the blocks that make up the windows, axis by axis; one block a window where sharing does not pay."""
-    axes = [_blocks_along(layout.size[axis], layout.step[axis], layout.count[axis]) for axis in (2, 1)]
-    axes.append((layout.size[0], layout.step[0], layout.count[0], 1, 1))
-    size, stride, count, per_window, hop = ((a[0], a[1], a[2]) for a in zip(*axes, strict=True))
-    first = (layout.first[2], layout.first[1], layout.first[0])
-    return Blocks(first, size, stride, count, per_window, hop)
+def cells_of(layout: WindowLayout, least: int = CELLS_PER_WINDOW, alone: Sequence[int] = ()) -> Cells:
+    """Return the cells that make up the windows, axis by axis.
 
-
-def _blocks_along(size: int, step: int, count: int) -> tuple[int, int, int, int, int]:
-    """Return size, stride, count, blocks per window and hop along one axis."""
-    block = gcd(size, step)
-    if block < SMALLEST_BLOCK or step >= size:
-        return size, step, count, 1, 1
-    hop, per_window = step // block, size // block
-    return block, block, (count - 1) * hop + per_window, per_window, hop
+    Windows share cells of their step's and size's common divisor, or parts of these; where it is small or windows are
+    weighted, and along the axes `alone` of (z, y, x), each window has cells of its own. A window has `least` along each
+    axis, or its voxels.
+    """
+    starts, sizes, per_window, hops = [], [], [], []
+    for axis, (size, step, count) in enumerate(zip(layout.size, layout.step, layout.count, strict=True)):
+        shared = gcd(size, step)
+        if shared < SMALLEST_BLOCK or step >= size or layout.is_weighted or 2 - axis in alone:
+            length, stride, blocks, hop = size, step, count, 1
+        else:
+            length, stride, blocks, hop = shared, shared, ((count - 1) * step + size) // shared, step // shared
+        parts = min(length, -(-least * length // size))
+        edges = np.arange(parts + 1) * length // parts
+        starts.append((stride * np.arange(blocks)[:, np.newaxis] + edges[:-1]).ravel())
+        sizes.append(np.tile(np.diff(edges), blocks))
+        per_window.append(parts * (size // length))
+        hops.append(parts * hop)
+    (x, y, z), (width, height, depth) = starts, sizes
+    return Cells((z, y, x), (depth, height, width), triple(per_window[::-1]), triple(hops[::-1]))
 
 
 def margins(layout: WindowLayout, shape_zyx: Triple, radius: int) -> tuple[Triple, Triple]:
@@ -84,7 +97,7 @@ def margins(layout: WindowLayout, shape_zyx: Triple, radius: int) -> tuple[Tripl
             last = max(last, layout.first[axis] + LANES)
         before.append(max(0, radius - layout.first[axis]))
         after.append(max(0, last + radius - voxels))
-    return (before[0], before[1], before[2]), (after[0], after[1], after[2])
+    return triple(before), triple(after)
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,7 +115,7 @@ class MapSums:
     products: Floats
     energies_a: NDArray[np.float32]
     energies_b: NDArray[np.float32]
-    blocks: Blocks
+    blocks: Cells
 
     def __add__(self, other: MapSums) -> MapSums:
         """Return the sums over two sets of pairs."""
@@ -112,12 +125,6 @@ class MapSums:
             self.energies_b + other.energies_b,
             self.blocks,
         )
-
-    def amplitude(self) -> Floats:
-        """Return the root of the sum of squares over each window where it stands, the mean of both volumes' in logs."""
-        middle = self.energies_a.shape[1] // 2
-        energy_a, energy_b = (e[:, middle, :, middle, :, middle] for e in (self.energies_a, self.energies_b))
-        return np.asarray((energy_a.astype(np.float64) * energy_b).transpose(0, 2, 1) ** 0.25)
 
     def correlation(self) -> Floats:
         """Return R, (nz, ny, nx, 2r + 1, 2r + 1, 2r + 1), zero where a window holds no tracers."""
@@ -129,8 +136,10 @@ class MapSums:
         maps = np.empty((nz, ny, nx, shifts**3))
         share_out(write_maps, nz * ny, blocks, energies, per_window, hop, SMALLEST_ENERGY**2 * brightest, maps)
         maps = maps.reshape(nz, ny, nx, shifts, shifts, shifts)
+        # The root of the sum of squares over each window where it stands, the mean of both volumes' in logs.
+        energy_a, energy_b = (e[:, shifts // 2, :, shifts // 2, :, shifts // 2] for e in energies)
+        amplitude = (energy_a.astype(np.float64) * energy_b).transpose(0, 2, 1) ** 0.25
         # The other windows are what most of the light comes from.
-        amplitude = self.amplitude()
         maps[amplitude < SMALLEST_AMPLITUDE * of_half_the_sum(amplitude)] = 0.0
         return maps
 
@@ -149,13 +158,71 @@ def map_sums(
     layout : windows, in voxels of the volume without margins
     before : the margins before the volume, (z, y, x)
     """
-    blocks = blocks_of(layout)
-    first = (blocks.first[0] + before[0], blocks.first[1] + before[1], blocks.first[2] + before[2])
+    blocks = cells_of(layout, 1, alone=(2,))
+    first = triple(low + margin for low, margin in zip(layout.first[::-1], before, strict=True))
     shifts = 2 * radius + 1
-    found = np.empty((*blocks.count, shifts, shifts, shifts))
-    share_out(sum_products, blocks.count[0] * blocks.count[1], (a, b), first, blocks.size, blocks.stride, found)
+    count = triple(starts.size for starts in blocks.start)
     energies_a, energies_b = (energies_of(volume, layout, before, radius) for volume in (a, b))
-    return MapSums(found, energies_a, energies_b, blocks)
+    if not layout.is_weighted:
+        found = np.empty((*count, shifts, shifts, shifts))
+        share_out(sum_products, count[0] * count[1], (a, b), first, blocks.start, blocks.size, found)
+        return MapSums(found, energies_a, energies_b, blocks)
+    weights = weight_matrices(layout, blocks)
+    here = Region(first, weights)
+
+    def products_of(z: int) -> Iterator[NDArray[np.float32]]:
+        still_a, still_b = here.of(a, z), here.of(b, z)
+        for shift in np.ndindex(shifts, shifts, shifts):
+            dz, dy, dx = (each - radius for each in shift)
+            yield still_a * here.of(b, z + dz, dy, dx) + here.of(a, z - dz, -dy, -dx) * still_b
+
+    products = weighted_sums(shifts**3, products_of, weights).transpose(0, 2, 3, 1).astype(np.float64, order="C")
+    return MapSums(products.reshape(*count, shifts, shifts, shifts), energies_a, energies_b, blocks)
+
+
+class Region(NamedTuple):
+    """The voxels that weighted windows cover: the first one (z, y, x), and the weights, of whose widths it is."""
+
+    first: Triple
+    weights: Weights
+
+    def of(self, volume: NDArray[Any], z: int, dy: int = 0, dx: int = 0) -> NDArray[Any]:
+        """Return a plane of the region in a volume with margins, moved by so many rows and columns."""
+        (z0, y0, x0), (_, rows, columns) = self.first, (weights.shape[1] for weights in self.weights)
+        return volume[z0 + z, y0 + dy : y0 + dy + rows, x0 + dx : x0 + dx + columns]
+
+
+def weight_matrices(layout: WindowLayout, cells: Cells, radius: int = 0) -> Weights:
+    """Return the weights (sums, voxels) along z, y, x with which voxels count in cells of weighted windows.
+
+    Voxels begin `radius` before the first window; each cell has a sum for each shift, from -radius to radius.
+    """
+    matrices = []
+    for axis in range(3):
+        start, size, weights = cells.start[axis], cells.size[axis], layout.weights(2 - axis)
+        matrix = np.zeros((start.size, 2 * radius + 1, start[-1] + size[-1] + 2 * radius), dtype=np.float32)
+        for cell, (begin, length) in enumerate(zip(start, size, strict=True)):
+            # The place in its own window.
+            place = begin - cell // cells.per_window[axis] * layout.step[2 - axis]
+            for shift in range(2 * radius + 1):
+                matrix[cell, shift, begin + shift : begin + shift + length] = weights[place : place + length]
+        matrices.append(matrix.reshape(-1, matrix.shape[2]))
+    return matrices[0], matrices[1], matrices[2]
+
+
+def weighted_sums(
+    fields: int, plane: Callable[[int], Iterable[NDArray[np.float32]]], weights: Weights
+) -> NDArray[np.float32]:
+    """Return sums (z, fields, y, x) over weighted windows of fields that are made plane by plane, (rows, columns)."""
+    along_z, along_y, along_x = weights
+    lateral = np.empty((along_z.shape[1], fields, len(along_y), len(along_x)), dtype=np.float32)
+
+    def work(z: int) -> None:
+        for number, field in enumerate(plane(z)):
+            lateral[z, number] = along_y @ field @ along_x.T
+
+    in_threads(work, range(len(lateral)))
+    return np.tensordot(along_z, lateral, axes=1)
 
 
 def energies_of(
@@ -166,24 +233,69 @@ def energies_of(
     One axis after the other. Differences of running sums would take less, but an empty window next to bright ones must
     be exactly zero.
     """
-    size, step, count, low = (triple[::-1] for triple in (layout.size, layout.step, layout.count, layout.first))
-    first = (low[0] + before[0], low[1] + before[1], low[2] + before[2])
+    size, step, count, low = (each[::-1] for each in (layout.size, layout.step, layout.count, layout.first))
+    first = triple(begin + margin for begin, margin in zip(low, before, strict=True))
     shifts = 2 * radius + 1
     nz, ny, nx = count
+    if layout.is_weighted:
+        weights = weight_matrices(layout, cells_of(layout, 1), radius)
+        whole = Region(triple(begin - radius for begin in first), weights)
+        sums = weighted_sums(1, lambda z: [whole.of(volume, z) ** 2], weights)
+        return sums.reshape(nz, shifts, ny, shifts, nx, shifts).transpose(0, 1, 4, 5, 2, 3).copy()
     planes = (nz - 1) * step[0] + size[0] + 2 * radius
     lateral = np.empty((planes, nx * shifts, ny * shifts), dtype=np.float32)
     share_out(sum_laterally, planes, volume, first, size, step, radius, lateral)
     rows = lateral.reshape(planes, nx * shifts * ny * shifts)
     found = np.empty((nz, shifts, rows.shape[1]), dtype=np.float32)
-    share_out(sum_planes, nz, rows, size[0], step[0], radius, found)
+    in_threads(lambda k: sum_rows(rows, k * step[0] + radius, size[0], radius, found[k]), range(nz))
     return found.reshape(nz, shifts, nx, shifts, ny, shifts)
 
 
 def valid_shares(valid: NDArray[np.uint8], layout: WindowLayout, before: Triple) -> Floats:
     """Return the share of each window's voxels that are valid, (nz, ny, nx), from their flags 0 or 1."""
-    # The squares of 0 and 1 are themselves; float32, for which the sums are compiled anyway.
-    seen = energies_of(valid.astype(np.float32), layout, before)[:, 0, :, 0, :, 0].transpose(0, 2, 1)
+    # The squares of 0 and 1 are themselves; float32, for which the sums are compiled anyway. Each counts alike.
+    counted = replace(layout, weighting="uniform")
+    seen = energies_of(valid.astype(np.float32), counted, before)[:, 0, :, 0, :, 0].transpose(0, 2, 1)
     return seen / np.prod(layout.size, dtype=np.float64)
+
+
+def pair_moments(
+    a: NDArray[np.float32], b: NDArray[np.float32], valid: NDArray[np.uint8], layout: WindowLayout, before: Triple
+) -> Floats:
+    """Return the moments of all cells of two deformed volumes; of several pairs these add up.
+
+    Parameters
+    ----------
+    a, b, valid : of `deform_pair`, with a margin of at least 1 around all windows
+    layout : windows, in voxels of the volume without margins
+    before : the margins before the volume, (z, y, x)
+    """
+    cells = cells_of(layout)
+    first = triple(low + margin for low, margin in zip(layout.first[::-1], before, strict=True))
+    count = tuple(starts.size for starts in cells.start)
+    if not layout.is_weighted:
+        found = np.empty((*count, MOMENTS))
+        share_out(sum_cells, count[0] * count[1], (a, b), valid, first, cells.start, cells.size, found)
+        return found
+    weights = weight_matrices(layout, cells)
+    here, steps = Region(first, weights), ((0, 0, 1), (0, 1, 0), (1, 0, 0))
+
+    def moments_of(z: int) -> Iterator[NDArray[np.float32]]:
+        """The terms of `sum_cells`, in its order."""
+        mean, difference = 0.5 * (here.of(a, z) + here.of(b, z)), here.of(b, z) - here.of(a, z)
+        kept, of_mean, of_difference = here.of(valid, z).astype(np.float32), [], []
+        for dz, dy, dx in steps:
+            a_before, b_before = (here.of(volume, z - dz, -dy, -dx) for volume in (a, b))
+            a_after, b_after = (here.of(volume, z + dz, dy, dx) for volume in (a, b))
+            of_mean.append(0.25 * ((a_after + b_after) - (a_before + b_before)))
+            of_difference.append(0.25 * ((b_after - a_after) - (b_before - a_before)))
+            kept = kept * here.of(valid, z - dz, -dy, -dx) * here.of(valid, z + dz, dy, dx)
+        of_mean.append(mean)
+        yield from (kept * one * other for number, one in enumerate(of_mean) for other in of_mean[number:])
+        yield from (kept * one * difference for one in of_mean)
+        yield from (kept * one**2 for one in of_difference)
+
+    return weighted_sums(MOMENTS, moments_of, weights).transpose(0, 2, 3, 1).astype(np.float64, order="C")
 
 
 @njit(cache=True, nogil=True)
@@ -202,22 +314,15 @@ def sum_laterally(
     for z in range(part[0], part[1]):
         squares = np.empty(volume.shape[1:], dtype=np.float32)
         for y in range(volume.shape[1]):
-            square_row(volume[lowest + z, y], squares[y])
+            row, squared = volume[lowest + z, y], squares[y]
+            for x in range(row.size):
+                squared[x] = row[x] * row[x]
         along_y = np.empty((ny * shifts, volume.shape[2]), dtype=np.float32)
         for k in range(ny):
             sum_rows(squares, first[1] + k * step[1], size[1], radius, along_y[k * shifts : (k + 1) * shifts])
         turned = along_y.T.copy()
         for k in range(nx):
             sum_rows(turned, first[2] + k * step[2], size[2], radius, lateral[z, k * shifts : (k + 1) * shifts])
-
-
-@njit(cache=True, nogil=True)
-def sum_planes(
-    part: tuple[int, int], planes: NDArray[np.float32], size: int, step: int, radius: int, sums: NDArray[np.float32]
-) -> None:
-    """Write the sums of flat planes (z, n) over the windows `part` of (windows z, shifts z, n)."""
-    for k in range(part[0], part[1]):
-        sum_rows(planes, k * step + radius, size, radius, sums[k])
 
 
 @njit(cache=True)
@@ -234,12 +339,14 @@ def sum_ahead(values: NDArray[np.float32], spare: NDArray[np.float32], size: int
             done += length
         if 2 * length > size:
             return
-        write_sum(spare, values, values[length:])
+        later = values[length:]
+        for i in range(later.size):
+            spare[i] = values[i] + later[i]
         values, spare = spare, values
         length *= 2
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def sum_rows(rows: NDArray[np.float32], first: int, size: int, radius: int, sums: NDArray[np.float32]) -> None:
     """Write sums of `size` rows of (rows, columns), those from first + shift on for each shift up to `radius`.
 
@@ -263,20 +370,6 @@ def sum_rows(rows: NDArray[np.float32], first: int, size: int, radius: int, sums
             add_row(target, rows[row])
         for row in range(end, lowest + shift + size):
             add_row(target, rows[row])
-
-
-@njit(cache=True)
-def write_sum(target: NDArray[np.float32], one: NDArray[np.float32], other: NDArray[np.float32]) -> None:
-    """Write the sum of two rows, as far as the second one goes."""
-    for i in range(other.size):
-        target[i] = one[i] + other[i]
-
-
-@njit(cache=True)
-def square_row(row: NDArray[np.float32], squares: NDArray[np.float32]) -> None:
-    """Write the squares of a row."""
-    for x in range(row.size):
-        squares[x] = row[x] * row[x]
 
 
 @njit(cache=True, nogil=True)
@@ -330,8 +423,8 @@ def sum_products(
     part: tuple[int, int],
     pair: tuple[NDArray[np.float32], NDArray[np.float32]],
     first: Triple,
-    size: Triple,
-    stride: Triple,
+    start: Starts,
+    size: Starts,
     found: Floats,
 ) -> None:
     """Write the products of `MapSums` for the rows of blocks `part`."""
@@ -340,17 +433,17 @@ def sum_products(
     radius = shifts // 2
     row, plane = a.shape[2], a.shape[1] * a.shape[2]
     flat_a, flat_b = a.reshape(a.size), b.reshape(b.size)
-    length = max(LANES, (count[2] - 1) * stride[2] + size[2])
+    length = max(LANES, start[2][-1] + size[2][-1])
     together = MANY_SHIFTS if shifts >= MANY_SHIFTS else FEW_SHIFTS
     for job in range(part[0], part[1]):
         bz, by = job // count[1], job % count[1]
-        begin = (first[0] + bz * stride[0]) * plane + (first[1] + by * stride[1]) * row + first[2]
+        begin = (first[0] + start[0][bz]) * plane + (first[1] + start[1][by]) * row + first[2]
         room = np.empty((3, shifts**3 * length), dtype=np.float32)
         flat, spare, sums = room[0], room[1], room[2]
         # All shifts of a few columns before the next ones: their voxels then stay in the fastest cache.
-        for start in range(0, length, LANES):
+        for lane in range(0, length, LANES):
             # The last lanes, and the last shifts below, begin early enough to end with the others.
-            x = min(start, length - LANES)
+            x = min(lane, length - LANES)
             for sz in range(shifts):
                 for sy in range(shifts):
                     for group in range(0, shifts, together):
@@ -358,10 +451,50 @@ def sum_products(
                         at = ((sz * shifts + sy) * shifts + sx) * length + x
                         shift = (sz - radius) * plane + (sy - radius) * row + sx - radius
                         places, shifted = (begin + x, plane, row), (shift, together)
-                        products(flat, (at, length), flat_a, flat_b, places, (size[0], size[1]), shifted)
-        sum_ahead(flat, spare, size[2], sums)
+                        products(flat, (at, length), flat_a, flat_b, places, (size[0][bz], size[1][by]), shifted)
+        sum_ahead(flat, spare, size[2][0], sums)
         lines = sums.reshape(-1, length)
         for kx in range(count[2]):
             window = found[bz, by, kx].reshape(lines.shape[0])
             for shift in range(window.size):
-                window[shift] = lines[shift, kx * stride[2]]
+                window[shift] = lines[shift, start[2][kx]]
+
+
+@njit(cache=True, nogil=True)
+def sum_cells(
+    part: tuple[int, int],
+    pair: tuple[NDArray[np.float32], NDArray[np.float32]],
+    valid: NDArray[np.uint8],
+    first: Triple,
+    start: Starts,
+    size: Starts,
+    found: Floats,
+) -> None:
+    """Write the moments of cells, rows `part` of (cells z, y, x, MOMENTS), of windows that begin at the voxel `first`.
+
+    The upper triangle of the products of (dM/dx, dM/dy, dM/dz, M), row by row, those of each with B - A, and the
+    squares of the slopes of (B - A) / 2. Voxels with a neighbour that is not valid are left out: their gradient would
+    be that of the rim.
+    """
+    a, b = pair
+    count = found.shape[:3]
+    row, plane = a.shape[2], a.shape[1] * a.shape[2]
+    flat_a, flat_b, flat_valid = a.reshape(a.size), b.reshape(b.size), valid.reshape(valid.size)
+    length = max(LANES, start[2][-1] + size[2][-1])
+    for job in range(part[0], part[1]):
+        cz, cy = job // count[1], job % count[1]
+        begin = (first[0] + start[0][cz]) * plane + (first[1] + start[1][cy]) * row + first[2]
+        # Summed over the planes and rows of the cells first, many columns at once; float32 serves for so few.
+        columns = np.empty((MOMENTS, length), dtype=np.float32)
+        flat = columns.reshape(columns.size)
+        for lane in range(0, length, LANES):
+            # The last lanes begin early enough to end with the others.
+            x = min(lane, length - LANES)
+            places = (begin + x, plane, row)
+            lane_moments(flat, (x, length), flat_a, flat_b, flat_valid, places, (size[0][cz], size[1][cy]))
+        for cx in range(count[2]):
+            for moment in range(MOMENTS):
+                total = 0.0
+                for x in range(start[2][cx], start[2][cx] + size[2][cx]):
+                    total += columns[moment, x]
+                found[cz, cy, cx, moment] = total
