@@ -49,7 +49,7 @@ from lfpiv_cli.optics.curved_space import CurvedSpace
 from lfpiv_cli.optics.media import Window
 from lfpiv_cli.optics.tracing import ObjectSpace
 from lfpiv_cli.reference import Reference
-from lfpiv_cli.simd.combine import COEFFICIENTS
+from lfpiv_cli.simd import COEFFICIENTS
 from lfpiv_cli.weights.axis import AxisWeights
 from lfpiv_cli.weights.build import axis_optics
 from lfpiv_cli.weights.columns import ColumnOperator, OnDemandOperator

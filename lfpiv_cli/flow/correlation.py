@@ -31,12 +31,11 @@ from lfpiv_cli.flow.deformation import (
 )
 from lfpiv_cli.flow.field import VectorField
 from lfpiv_cli.flow.maps import MapSums, map_sums, margins, valid_shares
-from lfpiv_cli.flow.moments import cells_of, gauss_newton, pair_moments
+from lfpiv_cli.flow.moments import MOMENTS, cells_of, gauss_newton, pair_moments
 from lfpiv_cli.flow.outliers import expected_noise, fill_field, mixing, smooth_field, unresolved, validate_vectors
 from lfpiv_cli.flow.peaks import ELONGATED_WIDTH, Peaks, absolute, find_peaks, typical_width, undiluted
 from lfpiv_cli.flow.windows import Triple, WindowLayout, layout_windows
 from lfpiv_cli.grid import Grid
-from lfpiv_cli.simd.block_sums import MOMENTS
 from lfpiv_cli.threads import share_out
 
 # The coarse pass: correlation of binned volumes, which finds displacements up to a quarter of its windows.

@@ -24,12 +24,14 @@ from numpy.typing import NDArray
 from lfpiv_cli.arrays import Floats
 from lfpiv_cli.flow.windows import Triple, WindowLayout
 from lfpiv_cli.robust import of_half_the_sum
-from lfpiv_cli.simd.block_sums import FEW_SHIFTS, MANY_SHIFTS, products
-from lfpiv_cli.simd.vectors import LANES
-from lfpiv_cli.threads import share_out
+from lfpiv_cli.threads import COUNT_NO_REFERENCES, share_out
 
 # Blocks narrower than this cost more in sums of sums than the products they save.
 SMALLEST_BLOCK = 4
+# Columns whose products are summed for all shifts before the next ones': their voxels stay in the fastest cache. And
+# shifts along x that share what is read: with five a radius of 2 takes one pass over a row.
+COLUMNS = 64
+FEW_SHIFTS, MANY_SHIFTS = 3, 5
 # A window whose energy is below this share of the brightest one's is empty: what the splines carry into empty space
 # reaches amplitudes of 1e-5.
 SMALLEST_ENERGY = 1e-9
@@ -73,15 +75,10 @@ def _blocks_along(size: int, step: int, count: int) -> tuple[int, int, int, int,
 
 
 def margins(layout: WindowLayout, shape_zyx: Triple, radius: int) -> tuple[Triple, Triple]:
-    """Return how many voxels of zeros windows shifted by `radius` need before and after the volume, (z, y, x).
-
-    Along x there are at least `LANES` voxels from the first window's on, which are multiplied at once.
-    """
+    """Return how many voxels of zeros windows shifted by `radius` need before and after the volume, (z, y, x)."""
     before, after = [], []
     for axis, voxels in zip((2, 1, 0), shape_zyx, strict=True):
         last = layout.first[axis] + (layout.count[axis] - 1) * layout.step[axis] + layout.size[axis]
-        if axis == 0:
-            last = max(last, layout.first[axis] + LANES)
         before.append(max(0, radius - layout.first[axis]))
         after.append(max(0, last + radius - voxels))
     return (before[0], before[1], before[2]), (after[0], after[1], after[2])
@@ -340,28 +337,61 @@ def sum_products(
     radius = shifts // 2
     row, plane = a.shape[2], a.shape[1] * a.shape[2]
     flat_a, flat_b = a.reshape(a.size), b.reshape(b.size)
-    length = max(LANES, (count[2] - 1) * stride[2] + size[2])
+    length = (count[2] - 1) * stride[2] + size[2]
     together = MANY_SHIFTS if shifts >= MANY_SHIFTS else FEW_SHIFTS
+    summed = np.empty((MANY_SHIFTS, COLUMNS), dtype=np.float32)
+    target = summed.reshape(summed.size)
     for job in range(part[0], part[1]):
         bz, by = job // count[1], job % count[1]
         begin = (first[0] + bz * stride[0]) * plane + (first[1] + by * stride[1]) * row + first[2]
         room = np.empty((3, shifts**3 * length), dtype=np.float32)
         flat, spare, sums = room[0], room[1], room[2]
-        # All shifts of a few columns before the next ones: their voxels then stay in the fastest cache.
-        for start in range(0, length, LANES):
-            # The last lanes, and the last shifts below, begin early enough to end with the others.
-            x = min(start, length - LANES)
-            for sz in range(shifts):
-                for sy in range(shifts):
-                    for group in range(0, shifts, together):
-                        sx = min(group, shifts - together)
-                        at = ((sz * shifts + sy) * shifts + sx) * length + x
-                        shift = (sz - radius) * plane + (sy - radius) * row + sx - radius
-                        places, shifted = (begin + x, plane, row), (shift, together)
-                        products(flat, (at, length), flat_a, flat_b, places, (size[0], size[1]), shifted)
+        for x in range(0, length, COLUMNS):
+            columns = min(COLUMNS, length - x)
+            for group in range(0, shifts**3, shifts):
+                sz, sy = group // shifts // shifts, group // shifts % shifts
+                for start in range(0, shifts, together):
+                    # The last shifts begin early enough to end with the others.
+                    sx = min(start, shifts - together)
+                    shift = (sz - radius) * plane + (sy - radius) * row + sx - radius
+                    summed[:] = 0.0
+                    for z in range(size[0]):
+                        for y in range(size[1]):
+                            here = begin + z * plane + y * row + x
+                            a_here, b_here, b_there = flat_a[here:], flat_b[here:], flat_b[here + shift :]
+                            a_back = flat_a[here - shift - together + 1 :]
+                            # Numbers of shifts that the compiler knows: it then writes out their loop.
+                            if together == MANY_SHIFTS:
+                                add_products(target, a_here, b_here, b_there, a_back, columns, MANY_SHIFTS)
+                            else:
+                                add_products(target, a_here, b_here, b_there, a_back, columns, FEW_SHIFTS)
+                    for m in range(together):
+                        line, found_line = flat[(group + sx + m) * length + x :], summed[m]
+                        for k in range(columns):
+                            line[k] = found_line[k]
         sum_ahead(flat, spare, size[2], sums)
         lines = sums.reshape(-1, length)
         for kx in range(count[2]):
             window = found[bz, by, kx].reshape(lines.shape[0])
             for shift in range(window.size):
                 window[shift] = lines[shift, kx * stride[2]]
+
+
+@njit(cache=True, fastmath=True, **COUNT_NO_REFERENCES)
+def add_products(
+    target: NDArray[np.float32],
+    a: NDArray[np.float32],
+    b: NDArray[np.float32],
+    b_there: NDArray[np.float32],
+    a_back: NDArray[np.float32],
+    columns: int,
+    shifts: int,
+) -> None:
+    """Add a(x) b(x + s) + a(x - s) b(x) of one row for shifts that follow each other, `COLUMNS` apart in `target`.
+
+    `b_there` begins at the first shift, `a_back` at the last.
+    """
+    for x in range(columns):
+        a_here, b_here = a[x], b[x]
+        for m in range(shifts):
+            target[m * COLUMNS + x] += a_here * b_there[x + m] + a_back[x + shifts - 1 - m] * b_here

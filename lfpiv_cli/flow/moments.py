@@ -25,16 +25,15 @@ from numpy.typing import NDArray
 from lfpiv_cli.arrays import Floats
 from lfpiv_cli.flow.maps import SMALLEST_BLOCK
 from lfpiv_cli.flow.windows import Triple, WindowLayout
-from lfpiv_cli.simd.block_sums import MOMENTS
-from lfpiv_cli.simd.block_sums import moments as lane_moments
-from lfpiv_cli.simd.vectors import LANES
-from lfpiv_cli.threads import share_out
+from lfpiv_cli.threads import COUNT_NO_REFERENCES, share_out
 
 # Cells along an axis of a window, at least, where it has as many voxels: groups enough for a variance.
 CELLS_PER_WINDOW = 4
 # Three components and the gain. Moments are those of their derivatives, and those of these with B - A.
 UNKNOWNS = 4
 PRODUCTS = UNKNOWNS * (UNKNOWNS + 1) // 2
+# And the squares of the slopes of their difference.
+MOMENTS = PRODUCTS + UNKNOWNS + 3
 # A group is at least this many standard deviations of a particle image long: smaller ones share their particles, and
 # the spread of what they say is then too small.
 GROUP_SIGMAS = 2.0
@@ -46,7 +45,7 @@ SMALLEST_PIVOT = 1e-6
 # With a smaller response the volumes' slopes have next to nothing in common: errors stated are then large enough.
 SMALLEST_RESPONSE = 0.25
 
-
+Row = NDArray[np.float32]
 Starts = tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]
 
 
@@ -158,24 +157,92 @@ def sum_cells(
     count = found.shape[:3]
     row, plane = a.shape[2], a.shape[1] * a.shape[2]
     flat_a, flat_b, flat_valid = a.reshape(a.size), b.reshape(b.size), valid.reshape(valid.size)
-    length = max(LANES, start[2][-1] + size[2][-1])
+    length = start[2][-1] + size[2][-1]
+    room = np.empty((MOMENTS + UNKNOWNS + 5, length), dtype=np.float32)
+    columns, rest, kept = room[:MOMENTS], room[-2], room[-1]
+    known, slopes = room[MOMENTS : MOMENTS + UNKNOWNS], room[MOMENTS + UNKNOWNS : -2]
     for job in range(part[0], part[1]):
         cz, cy = job // count[1], job % count[1]
         begin = (first[0] + start[0][cz]) * plane + (first[1] + start[1][cy]) * row + first[2]
         # Summed over the planes and rows of the cells first, many columns at once; float32 serves for so few.
-        columns = np.empty((MOMENTS, length), dtype=np.float32)
-        flat = columns.reshape(columns.size)
-        for lane in range(0, length, LANES):
-            # The last lanes begin early enough to end with the others.
-            x = min(lane, length - LANES)
-            places = (begin + x, plane, row)
-            lane_moments(flat, (x, length), flat_a, flat_b, flat_valid, places, (size[0][cz], size[1][cy]))
+        columns[:] = 0.0
+        for z in range(size[0][cz]):
+            for y in range(size[1][cy]):
+                here = begin + z * plane + y * row
+                write_voxels(flat_a[here:], flat_b[here:], flat_valid[here:], known[3], rest, kept)
+                for axis in range(3):
+                    step = 1 if axis == 0 else row if axis == 1 else plane
+                    before, after = here - step, here + step
+                    write_slopes(
+                        (flat_a[before:], flat_a[after:]),
+                        (flat_b[before:], flat_b[after:]),
+                        (flat_valid[before:], flat_valid[after:]),
+                        (known[axis], slopes[axis], kept),
+                    )
+                moment = 0
+                for i in range(UNKNOWNS):
+                    multiply(known[i], kept)
+                for i in range(UNKNOWNS):
+                    for j in range(i, UNKNOWNS):
+                        add_product(columns[moment], known[i], known[j])
+                        moment += 1
+                for i in range(UNKNOWNS):
+                    add_product(columns[PRODUCTS + i], known[i], rest)
+                for i in range(3):
+                    multiply(slopes[i], kept)
+                    add_product(columns[PRODUCTS + UNKNOWNS + i], slopes[i], slopes[i])
         for cx in range(count[2]):
             for moment in range(MOMENTS):
                 total = 0.0
                 for x in range(start[2][cx], start[2][cx] + size[2][cx]):
                     total += columns[moment, x]
                 found[cz, cy, cx, moment] = total
+
+
+@njit(cache=True, **COUNT_NO_REFERENCES)
+def write_voxels(a: Row, b: Row, valid: NDArray[np.uint8], mean: Row, rest: Row, kept: Row) -> None:
+    """Write the mean of two rows, their difference and which voxels are valid."""
+    for x in range(kept.size):
+        mean[x] = np.float32(0.5) * (a[x] + b[x])
+        rest[x] = b[x] - a[x]
+        kept[x] = np.float32(valid[x])
+
+
+@njit(cache=True, **COUNT_NO_REFERENCES)
+def write_slopes(
+    a: tuple[Row, Row],
+    b: tuple[Row, Row],
+    valid: tuple[NDArray[np.uint8], NDArray[np.uint8]],
+    out: tuple[Row, Row, Row],
+) -> None:
+    """Write the central differences of the mean and of half the difference, from the rows before and after each.
+
+    Voxels with a neighbour that is not valid are struck out of the last of `out`.
+    """
+    a_before, a_after = a
+    b_before, b_after = b
+    valid_before, valid_after = valid
+    of_mean, of_difference, kept = out
+    for x in range(kept.size):
+        rise_a, rise_b = a_after[x] - a_before[x], b_after[x] - b_before[x]
+        of_mean[x] = np.float32(0.25) * (rise_a + rise_b)
+        of_difference[x] = np.float32(0.25) * (rise_b - rise_a)
+    for x in range(kept.size):
+        kept[x] *= np.float32(valid_before[x] & valid_after[x])
+
+
+@njit(cache=True, **COUNT_NO_REFERENCES)
+def multiply(target: Row, factor: Row) -> None:
+    """Multiply a row by another."""
+    for x in range(target.size):
+        target[x] *= factor[x]
+
+
+@njit(cache=True, fastmath=True, **COUNT_NO_REFERENCES)
+def add_product(target: Row, one: Row, other: Row) -> None:
+    """Add the product of two rows to a row."""
+    for x in range(target.size):
+        target[x] += one[x] * other[x]
 
 
 @njit(cache=True)

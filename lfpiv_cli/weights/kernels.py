@@ -20,8 +20,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from lfpiv_cli.simd.combine import (
+from lfpiv_cli.simd import (
     GROUP,
+    LANES,
     TILE,
     VECTORS,
     combine_line,
@@ -30,7 +31,6 @@ from lfpiv_cli.simd.combine import (
     combine_vector,
     turn,
 )
-from lfpiv_cli.simd.vectors import LANES
 from lfpiv_cli.threads import in_threads, share_out
 
 Floats = NDArray[np.float32]

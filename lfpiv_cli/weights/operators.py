@@ -23,8 +23,7 @@ from numba import get_num_threads
 from numpy.typing import NDArray
 
 from lfpiv_cli.errors import InputError
-from lfpiv_cli.simd.combine import GROUP, TILE
-from lfpiv_cli.simd.vectors import LANES
+from lfpiv_cli.simd import GROUP, LANES, TILE
 from lfpiv_cli.threads import ensure_own_threads
 from lfpiv_cli.weights import kernels
 from lfpiv_cli.weights.axis import AxisWeights

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.curved_space import CurvedSpace
-from lfpiv_cli.simd.combine import TILE
+from lfpiv_cli.simd import TILE
 from lfpiv_cli.weights.axis import axis_weights, depth_nodes
 from lfpiv_cli.weights.lens_cells import AxisOptics, Cells, aperture_mask, micro_image_cells
 from lfpiv_cli.weights.quadrature import integrate_columns

@@ -15,9 +15,10 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from lfpiv_cli.simd.combine import (
+from lfpiv_cli.simd import (
     COEFFICIENTS,
     GROUP,
+    LANES,
     TILE,
     VECTORS,
     combine_long,
@@ -25,7 +26,6 @@ from lfpiv_cli.simd.combine import (
     combine_varying,
     turn,
 )
-from lfpiv_cli.simd.vectors import LANES
 from lfpiv_cli.threads import in_threads, share_out
 from lfpiv_cli.weights.kernels import Floats, Index, LitRows, Terms, room_for
 

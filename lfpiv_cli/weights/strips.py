@@ -24,8 +24,7 @@ import numpy as np
 from numba import get_num_threads
 from numpy.typing import NDArray
 
-from lfpiv_cli.simd.combine import COEFFICIENTS, GROUP, TILE
-from lfpiv_cli.simd.vectors import LANES
+from lfpiv_cli.simd import COEFFICIENTS, GROUP, LANES, TILE
 from lfpiv_cli.threads import ensure_own_threads
 from lfpiv_cli.weights import kernels, strip_kernels
 from lfpiv_cli.weights.axis import AxisWeights
