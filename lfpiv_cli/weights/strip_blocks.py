@@ -21,6 +21,7 @@ from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.curved_space import CurvedSpace
 from lfpiv_cli.simd import TILE
 from lfpiv_cli.weights.axis import axis_weights, depth_nodes
+from lfpiv_cli.weights.kernels import PLACES, SLAB, STRIP, Blocks
 from lfpiv_cli.weights.lens_cells import AxisOptics, Cells, aperture_mask, micro_image_cells
 from lfpiv_cli.weights.quadrature import integrate_columns
 from lfpiv_cli.weights.scene import lit_voxels, places_on_array
@@ -37,7 +38,6 @@ from lfpiv_cli.weights.strip_fits import (
     strip_rays,
     through_lines,
 )
-from lfpiv_cli.weights.strip_kernels import PLACES, SLAB, STRIP, Blocks
 from lfpiv_cli.weights.strips import FINE_PARTS, StripOperator, part_of_cells, sorted_cells
 
 # Rays of each part of a strip.
