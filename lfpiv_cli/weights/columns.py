@@ -308,28 +308,20 @@ def _seen_shares(part: tuple[int, int], scene: Scene, lit: NDArray[np.bool_], se
 
     Those of voxels `part`; `lit` is flat.
     """
+    camera, middle = scene.camera, scene.depth_share.size // 2
     for n in range(part[0], part[1]):
-        seen[n] = _lit_share(scene, scene.centres_mm[n], scene.plane[n], lit)
-
-
-@njit(cache=True)
-def _lit_share(scene: Scene, point: NDArray[np.float64], plane: int, lit: NDArray[np.bool_]) -> float:
-    """Return the share of the lines of sight from a point, among those that meet the sensor, that end on lit pixels."""
-    camera, total, found = scene.camera, 0.0, 0.0
-    middle = scene.depth_share.size // 2
-    rays = rays_from(scene, point, plane, middle)
-    if rays.shape[1] == 0:
-        return 0.0
-    for t in range(scene.tile_share.size):
-        crossing = scene.tile_mm[t]
-        x, y = on_array(scene, point, rays, crossing[0], crossing[1])
-        distorted = 1.0 + camera.distortion_per_mm2 * (x * x + y * y)
-        m_x, m_y = x * distorted, y * distorted
-        centre_x, centre_y = nearest_point(m_x, m_y, camera.origin_mm, camera.basis_mm)
-        x = on_sensor(camera, x, crossing[0], m_x, centre_x)
-        y = on_sensor(camera, y, crossing[1], m_y, centre_y)
-        pixel = struck_pixel(camera, x, y)
-        if pixel >= 0:
-            total += scene.tile_share[t]
-            found += scene.tile_share[t] * lit[pixel]
-    return found / total if total > 0.0 else 0.0
+        point, total, found = scene.centres_mm[n], 0.0, 0.0
+        rays = rays_from(scene, point, scene.plane[n], middle)
+        for t in range(scene.tile_share.size if rays.shape[1] > 0 else 0):
+            crossing = scene.tile_mm[t]
+            x, y = on_array(scene, point, rays, crossing[0], crossing[1])
+            distorted = 1.0 + camera.distortion_per_mm2 * (x * x + y * y)
+            m_x, m_y = x * distorted, y * distorted
+            centre_x, centre_y = nearest_point(m_x, m_y, camera.origin_mm, camera.basis_mm)
+            x = on_sensor(camera, x, crossing[0], m_x, centre_x)
+            y = on_sensor(camera, y, crossing[1], m_y, centre_y)
+            pixel = struck_pixel(camera, x, y)
+            if pixel >= 0:
+                total += scene.tile_share[t]
+                found += scene.tile_share[t] * lit[pixel]
+        seen[n] = found / total if total > 0.0 else 0.0

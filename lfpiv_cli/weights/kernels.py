@@ -19,7 +19,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import get_num_threads, njit
+from numba import njit
 from numpy.typing import NDArray
 
 from lfpiv_cli.simd import (
@@ -36,7 +36,7 @@ from lfpiv_cli.simd import (
     combine_vector,
     turn,
 )
-from lfpiv_cli.threads import in_threads, share_out
+from lfpiv_cli.threads import share_out
 
 Floats = NDArray[np.float32]
 Index = NDArray[np.int64]
@@ -179,18 +179,8 @@ def _turn_planes(part: tuple[int, int], volume: Floats, found: Floats) -> None:
                 found[plane, column, row] = volume[plane, row, column]
 
 
-def project(
-    volume: Floats, blocks: Blocks, shape: BlockShape, columns: VisitsForward, rows: RowSums, groups: int
-) -> Floats:
-    """Return the light by cells (tiles, groups * GROUP, TILE) of a turned volume."""
-    tiles = columns.of_tile.size - 1
-    flat_cell = room_for(tiles * groups * GROUP * TILE)
-    share_out(_project_tiles, tiles, volume, blocks, shape, columns, rows, groups, PLACES, flat_cell)
-    return flat_cell.reshape(tiles, groups * GROUP, TILE)
-
-
 @njit(cache=True, nogil=True)
-def _project_tiles(
+def project_tiles(
     part: tuple[int, int],
     volume: Floats,
     blocks: Blocks,
@@ -201,7 +191,7 @@ def _project_tiles(
     places: Floats,
     flat_cell: Floats,
 ) -> None:
-    """Write a part of the tiles of `project`."""
+    """Write a part of the tiles of a turned volume's light by cells, flat (tiles, groups * GROUP, TILE)."""
     width, height = volume.shape[1:]
     coefficients = columns.share.shape[1]
     flat_volume, share = volume.reshape(-1), columns.share.reshape(-1)
@@ -232,34 +222,8 @@ def _project_tiles(
                 )
 
 
-def back_project(
-    by_cell: Floats,
-    volume_shape: tuple[int, int, int],
-    blocks: Blocks,
-    shape: BlockShape,
-    rows: Terms,
-    columns: VisitsBack,
-) -> Floats:
-    """Return the turned volume of a shape that light by cells (tiles, row cells, TILE) is spread back to.
-
-    Each block has for each of its lines planes / GROUP sums in `rows`, whose terms are lines of `by_cell`.
-    """
-    volume = np.zeros(volume_shape, np.float32)
-    tiles, threads = by_cell.shape[0], get_num_threads()
-    slabs = (columns.of_tile.size - 1) // max(tiles, 1)
-    visits = np.diff(columns.of_tile).reshape(tiles, slabs).sum(axis=0)
-    # A thread takes a tile through all of its planes, so that the cells come into its cache once.
-    ends = np.searchsorted(np.cumsum(visits), visits.sum() * np.arange(1, threads) / threads)
-    edges = [0, *ends.tolist(), slabs]
-    in_threads(
-        lambda part: _back_project_slabs(part, by_cell, volume, blocks, shape, rows, columns, PLACES),
-        list(zip(edges, edges[1:], strict=False)),
-    )
-    return volume
-
-
 @njit(cache=True, nogil=True)
-def _back_project_slabs(
+def back_project_slabs(
     part: tuple[int, int],
     by_cell: Floats,
     volume: Floats,
@@ -269,7 +233,11 @@ def _back_project_slabs(
     columns: VisitsBack,
     places: Floats,
 ) -> None:
-    """Write a part of the volume of `back_project`, counted in slabs of planes."""
+    """Add what light by cells (tiles, row cells, TILE) is spread back to, in a part of a turned volume.
+
+    The part counts slabs of planes. Each block has for each of its lines planes / GROUP sums in `rows`, whose terms are
+    lines of `by_cell`.
+    """
     width, height = volume.shape[1:]
     tiles, size = by_cell.shape[0], by_cell.shape[1] * TILE
     slabs = (columns.of_tile.size - 1) // max(tiles, 1)
@@ -312,20 +280,13 @@ def _back_project_slabs(
                     to_voxel += height
 
 
-def fold(by_cell: Floats, mask: Floats, runs: Index, rows: LitRows, shape: tuple[int, int]) -> Floats:
-    """Return the image (rows, columns) of `shape`: C times the light of each lit cell, added up by pixel.
+@njit(cache=True, nogil=True)
+def fold_rows(part: tuple[int, int], by_cell: Floats, mask: Floats, runs: Index, rows: LitRows, image: Floats) -> None:
+    """Write a part of the rows of the image: C times the light of each lit cell, added up by pixel.
 
     `runs` (runs, 5) are neighbouring column cells of a tile, and of a lens: the first one's number among all cells and
     its place among the lit, its pixel, how many they are, and whether the others follow (1) or come before (-1).
     """
-    image = np.empty(shape, np.float32)
-    share_out(_fold_rows, shape[0], by_cell, mask, runs, rows, image)
-    return image
-
-
-@njit(cache=True, nogil=True)
-def _fold_rows(part: tuple[int, int], by_cell: Floats, mask: Floats, runs: Index, rows: LitRows, image: Floats) -> None:
-    """Write a part of the image rows of `fold`."""
     for row in range(part[0], part[1]):
         target = image[row]
         target[:] = 0.0
@@ -342,22 +303,8 @@ def _fold_rows(part: tuple[int, int], by_cell: Floats, mask: Floats, runs: Index
                         target[pixel + n] += weight[cell + n] * source[k - n]
 
 
-def unfold(
-    image: Floats, mask: Floats, pixel: NDArray[np.int32], rows: tuple[int, int], row_pixel: NDArray[np.int32]
-) -> Floats:
-    """Return C times the pixel that each lit cell belongs to, (tiles, lit row cells, TILE).
-
-    `mask` (row cells, cells) and `pixel` are those of the lit column cells in their order.
-    """
-    tiles, lines = -(-pixel.size // TILE), rows[1] - rows[0]
-    by_cell = room_for(tiles * lines * TILE).reshape(tiles, lines, TILE)
-    by_cell[-1:] = 0.0
-    share_out(_unfold_lines, lines, image, mask, pixel, row_pixel[rows[0] : rows[1]], rows[0], by_cell)
-    return by_cell
-
-
 @njit(cache=True, nogil=True)
-def _unfold_lines(
+def unfold_lines(
     part: tuple[int, int],
     image: Floats,
     mask: Floats,
@@ -366,7 +313,11 @@ def _unfold_lines(
     first: int,
     by_cell: Floats,
 ) -> None:
-    """Write a part of the lit row cells of `unfold`, the first of which is row cell `first`."""
+    """Write C times the pixel that each lit cell belongs to, a part of the lit row cells of (tiles, row cells, TILE).
+
+    `mask` (row cells, cells) and `pixel` are those of the lit column cells in their order; the first lit row cell is
+    row cell `first`, and `row_pixel` has the pixels of the lit ones.
+    """
     for line in range(part[0], part[1]):
         source, weight = image[row_pixel[line]], mask[first + line]
         for begin in range(0, pixel.size, TILE):

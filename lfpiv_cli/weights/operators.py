@@ -19,14 +19,25 @@ from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
+from numba import get_num_threads
 from numpy.typing import NDArray
 
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.simd import GROUP, LANES, TILE
-from lfpiv_cli.threads import ensure_own_threads
+from lfpiv_cli.threads import ensure_own_threads, in_threads, share_out
 from lfpiv_cli.weights import kernels
 from lfpiv_cli.weights.axis import AxisWeights
-from lfpiv_cli.weights.kernels import Blocks, BlockShape, Index, LitRows, RowSums, Terms, VisitsBack, VisitsForward
+from lfpiv_cli.weights.kernels import (
+    PLACES,
+    Blocks,
+    BlockShape,
+    Index,
+    LitRows,
+    RowSums,
+    Terms,
+    VisitsBack,
+    VisitsForward,
+)
 
 # Planes that go through both steps together, one number forward and one back: what they hold of a tile stays in the
 # second-level cache, what the neighbouring sums share of it in the first, and yet the sums over them are long.
@@ -109,17 +120,36 @@ class BlockProducts:
 
     def project(self, volume: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return the image (rows, columns) of a turned volume (planes, voxels along the columns, lines)."""
-        groups = int(self._lines_of_rows.line.max(initial=-1)) // GROUP + 1
-        by_cell = kernels.project(volume, *self.forward_blocks, self._columns_forward, self._rows_forward, groups)
-        return kernels.fold(
-            by_cell, self.mask, self._runs, self._lines_of_rows, (self.rows.pixels, self.columns.pixels)
-        )
+        columns, (blocks, shape) = self._columns_forward, self.forward_blocks
+        tiles, groups = columns.of_tile.size - 1, self._groups
+        flat_cell = kernels.room_for(tiles * groups * GROUP * TILE)
+        tables = blocks, shape, columns, self._rows_forward, groups, PLACES
+        share_out(kernels.project_tiles, tiles, volume, *tables, flat_cell)
+        by_cell = flat_cell.reshape(tiles, groups * GROUP, TILE)
+        image = np.empty((self.rows.pixels, self.columns.pixels), np.float32)
+        share_out(kernels.fold_rows, len(image), by_cell, self.mask, self._runs, self._lines_of_rows, image)
+        return image
 
     def back_project(self, image: NDArray[np.float32], shape: tuple[int, int, int]) -> NDArray[np.float32]:
         """Return the turned volume of a shape that an image is spread back to."""
-        pixel = self.columns.cells.pixel[self.order]
-        by_cell = kernels.unfold(image, self._sorted_mask, pixel, self._lit_rows, self.rows.cells.pixel)
-        return kernels.back_project(by_cell, shape, *self.back_blocks, self._rows_back, self._columns_back)
+        tiles, (first, last) = filled(self.order.size, TILE) // TILE, self._lit_rows
+        pixel, row_pixel = self.columns.cells.pixel[self.order], self.rows.cells.pixel[first:last]
+        by_cell = kernels.room_for(tiles * (last - first) * TILE).reshape(tiles, last - first, TILE)
+        by_cell[-1:] = 0.0
+        share_out(kernels.unfold_lines, last - first, image, self._sorted_mask, pixel, row_pixel, first, by_cell)
+
+        columns, threads, volume = self._columns_back, get_num_threads(), np.zeros(shape, np.float32)
+        slabs = (columns.of_tile.size - 1) // max(tiles, 1)
+        visits = np.diff(columns.of_tile).reshape(tiles, slabs).sum(axis=0)
+        # A thread takes a tile through all of its planes, so that the cells come into its cache once.
+        ends = np.searchsorted(np.cumsum(visits), visits.sum() * np.arange(1, threads) / threads)
+        edges = [0, *ends.tolist(), slabs]
+        tables = *self.back_blocks, self._rows_back, columns, PLACES
+        in_threads(
+            lambda part: kernels.back_project_slabs(part, by_cell, volume, *tables),
+            list(zip(edges, edges[1:], strict=False)),
+        )
+        return volume
 
     @cached_property
     def _lit_rows(self) -> tuple[int, int]:
@@ -141,6 +171,10 @@ class BlockProducts:
         return start[which] + cell - np.maximum(starts[lens], first)
 
     @cached_property
+    def _groups(self) -> int:
+        return int(self._line_of_cell.max(initial=-1)) // GROUP + 1
+
+    @cached_property
     def _lines_of_rows(self) -> LitRows:
         """The lit row cells in the order of their pixels."""
         first, last = self._lit_rows
@@ -151,7 +185,7 @@ class BlockProducts:
 
     @cached_property
     def _runs(self) -> Index:
-        """The runs (runs, 5) of lit column cells that stand side by side in a tile and a lens; see `kernels.fold`."""
+        """The runs (runs, 5) of lit column cells side by side in a tile and a lens; see `kernels.fold_rows`."""
         place = np.argsort(self.order)
         cell = self.order[place].astype(np.int64)
         step, tile = np.diff(place), place // TILE
@@ -212,7 +246,7 @@ class BlockProducts:
         """For each `GROUP` row cells of a lens the lines of each block that reach any of them, and the shares."""
         blocks, shape = self.forward_blocks
         group, member = np.divmod(self._line_of_cell[self.rows.cell - self._lit_rows[0]], GROUP)
-        groups = int(self._line_of_cell.max(initial=-1)) // GROUP + 1
+        groups = self._groups
         block, plane, line = self._block_lines(blocks)
         line += plane * shape.lines
         terms = packed(block * groups + group, line, member, self.rows.share, (blocks.plane.size * groups, GROUP))

@@ -23,43 +23,11 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from lfpiv_cli.simd import GROUP
 from lfpiv_cli.threads import ensure_own_threads
 from lfpiv_cli.weights import kernels
 from lfpiv_cli.weights.axis import AxisWeights
-from lfpiv_cli.weights.kernels import PLACES, SLAB, STRIP, Blocks, BlockShape, Index
-from lfpiv_cli.weights.lens_cells import Cells
+from lfpiv_cli.weights.kernels import PLACES, SLAB, STRIP, Blocks, BlockShape
 from lfpiv_cli.weights.operators import BlockProducts, Column, real_array, voxel_index
-
-# Column cells are sorted by which part of the aperture they see, so that those of a tile see the same: light through
-# one part then comes from some of the tiles only.
-
-
-# Parts of the aperture, side by side: by those along the strips column cells are sorted, and blocks have some
-# neighbouring ones of those across.
-PARTS, FINE_PARTS = 6, 12
-
-
-def part_of_cells(cells: Cells, radius_mm: float, parts: int) -> Index:
-    """Return which of so many equal parts of the aperture each cell sees; that of two that share their sums is one."""
-    middle = cells.patch_mm.mean(axis=1)
-    lens = np.searchsorted(cells.start, np.arange(middle.size), side="right") - 1
-    pair = cells.start[lens] + (np.arange(middle.size) - cells.start[lens]) // GROUP * GROUP
-    other = np.minimum(pair + GROUP - 1, cells.start[lens + 1] - 1)
-    middle = 0.5 * (middle[pair] + middle[other])
-    return np.clip((middle + radius_mm) * parts / (2.0 * radius_mm), 0, parts - 1).astype(np.int64)
-
-
-def sorted_cells(cells: Cells, lenses: tuple[int, int], radius_mm: float) -> NDArray[np.int32]:
-    """Return the cells of some lenses, the first and the last by number, by what part of the aperture they see.
-
-    To and fro along the axis, so that neighbours are of neighbouring lenses.
-    """
-    first, last = (int(np.clip(n - cells.first_lens, 0, cells.start.size - 1)) for n in (lenses[0], lenses[1] + 1))
-    cell = np.arange(cells.start[first], cells.start[last])
-    part = part_of_cells(cells, radius_mm, PARTS)[cell]
-    return cell[np.lexsort((np.where(part % 2, -cell, cell), part))].astype(np.int32)
-
 
 Scalar = TypeVar("Scalar", bound=np.generic)
 
@@ -124,21 +92,20 @@ class StripOperator:
         seen = image.T if self.turned else image
         line, along = (column_voxel, row_voxel) if self.turned else (row_voxel, column_voxel)
         if self.lit[plane, row_voxel, column_voxel]:
-            for virtual, within in self._planes_of(plane, line):
+            blocks, first = self.blocks, np.concatenate([[0], np.cumsum(self.blocks.planes)])
+            own = (blocks.plane <= plane) & (plane < blocks.plane + blocks.planes)
+            own &= (blocks.line <= line) & (line < blocks.line + STRIP)
+            for block in np.flatnonzero(own):
+                virtual, within = int(first[block] + plane - blocks.plane[block]), int(line - blocks.line[block])
                 row, across = self.rows.row(virtual, within)
                 column, share = self.columns.row(virtual, along)
-                by_cell = np.outer(across, shares_of(share, within)) * self.mask[np.ix_(row, column)]
+                t = PLACES[within]
+                shares = np.maximum(share[:, 0] + t * (share[:, 1] + t * share[:, 2]), 0.0)
+                by_cell = np.outer(across, shares) * self.mask[np.ix_(row, column)]
                 pixels = np.ix_(self.rows.cells.pixel[row], self.columns.cells.pixel[column])
                 np.add.at(seen, pixels, by_cell)
         lit = np.nonzero(image)
         return lit[0].astype(np.int64), lit[1].astype(np.int64), image[lit]
-
-    def _planes_of(self, plane: int, line: int) -> list[tuple[int, int]]:
-        """Return the planes of blocks that a line of voxels has, and which of their lines it is."""
-        blocks, first = self.blocks, np.concatenate([[0], np.cumsum(self.blocks.planes)])
-        own = (blocks.plane <= plane) & (plane < blocks.plane + blocks.planes)
-        own &= (blocks.line <= line) & (line < blocks.line + STRIP)
-        return [(int(first[b] + plane - blocks.plane[b]), int(line - blocks.line[b])) for b in np.flatnonzero(own)]
 
     def _as_lines(self, volume: NDArray[Scalar]) -> NDArray[Scalar]:
         """Return a view of a volume whose second axis runs across the strips; its own inverse."""
@@ -153,9 +120,3 @@ class StripOperator:
     def _products(self) -> BlockProducts:
         blocks = self.blocks, BlockShape(SLAB, STRIP)
         return BlockProducts(self.columns, self.rows, self.mask, self.order, blocks, blocks)
-
-
-def shares_of(coefficients: NDArray[np.float32], line: int) -> NDArray[np.float32]:
-    """Return the shares (n,) that one line of a strip has, of coefficients (n, COEFFICIENTS)."""
-    t = PLACES[line]
-    return np.asarray(np.maximum(coefficients[:, 0] + t * (coefficients[:, 1] + t * coefficients[:, 2]), 0.0))
