@@ -23,8 +23,7 @@ from lfpiv_cli.weights.axis import Bending, FittedBending, axis_weights, depth_n
 from lfpiv_cli.weights.lens_cells import AxisOptics, aperture_mask
 from lfpiv_cli.weights.operators import BrickOperator, FactorisedOperator
 from lfpiv_cli.weights.scene import Source
-from lfpiv_cli.weights.strip_blocks import StripLayout, factorise_strips, strip_layout
-from lfpiv_cli.weights.strips import StripOperator
+from lfpiv_cli.weights.strip_blocks import StripLayout, strip_layout
 
 # A lattice counts as aligned with the sensor when over its whole width it strays by less than a hundredth of a pixel.
 ALIGNED_PX = 0.01
@@ -170,21 +169,6 @@ def separates(camera: Camera, source: Source, grid: Grid) -> bool:
 def strips_of(camera: Camera, space: CurvedSpace, grid: Grid) -> StripLayout | None:
     """Return the strips of a volume within which array and rays separate into two axes; None where they do in none."""
     return strip_layout(camera, space, grid, axis_optics(camera)) if aligned(camera) else None
-
-
-def weights_in_axes(camera: Camera, source: Source, grid: Grid) -> FactorisedOperator | StripOperator | None:
-    """Return the weights of a grid in factorised form, whole or in strips; None where array or rays do not separate.
-
-    Raises
-    ------
-    ConfigError : a voxel lies where it cannot be
-    """
-    if isinstance(source, CurvedSpace) and aligned(camera):
-        layout = strips_of(camera, source, grid)
-        return factorise_strips(camera, source, grid, axis_optics(camera), layout.turned) if layout else None
-    if isinstance(source, CurvedSpace) or not separates(camera, source, grid):
-        return None
-    return factorise_through(camera, source, grid)
 
 
 def aligned(camera: Camera) -> bool:

@@ -24,10 +24,11 @@ from lfpiv_cli.optics.curved_space import CurvedSpace
 from lfpiv_cli.optics.tracing import struck_pixel
 from lfpiv_cli.robust import BRIGHTEST_PERCENTILE, LIT_SHARE
 from lfpiv_cli.threads import share_out
-from lfpiv_cli.weights.build import weights_in_axes
+from lfpiv_cli.weights.build import axis_optics, factorise_through, separates, strips_of
 from lfpiv_cli.weights.operators import Column, FactorisedOperator, real_array, voxel_index
 from lfpiv_cli.weights.quadrature import DEPTH_NODES, TILES, Columns, integrate_columns
 from lfpiv_cli.weights.scene import Scene, Source, kernel_scene, lit_voxels, on_array, on_sensor, rays_from
+from lfpiv_cli.weights.strip_blocks import factorise_strips, voxel_centres
 from lfpiv_cli.weights.strips import StripOperator
 
 # Columns may take this much memory: two thirds of a machine with 24 GiB, the rest is for volumes and images.
@@ -203,10 +204,7 @@ class OnDemandOperator:
 
     def centres_mm(self, voxel: NDArray[np.int64]) -> NDArray[np.float64]:
         """Return the centres (n, 3) of voxels, image axes."""
-        plane, row, column = np.unravel_index(voxel, self.shape)
-        first, second = (0, 1) if self.camera.column_axis == "x" else (1, 0)
-        axes = (self.grid.axis_mm(first)[column], self.grid.axis_mm(second)[row], self.grid.axis_mm(2)[plane])
-        return np.stack(axes, axis=1)
+        return voxel_centres(self.camera, self.grid, np.stack(np.unravel_index(voxel, self.shape), axis=1))
 
 
 def operator_of(camera: Camera, source: Source, grid: Grid) -> FactorisedOperator | StripOperator | OnDemandOperator:
@@ -218,7 +216,12 @@ def operator_of(camera: Camera, source: Source, grid: Grid) -> FactorisedOperato
     ------
     ConfigError : a voxel lies where it cannot be
     """
-    return weights_in_axes(camera, source, grid) or OnDemandOperator(camera, source, grid)
+    if isinstance(source, CurvedSpace):
+        if layout := strips_of(camera, source, grid):
+            return factorise_strips(camera, source, grid, axis_optics(camera), layout.turned)
+    elif separates(camera, source, grid):
+        return factorise_through(camera, source, grid)
+    return OnDemandOperator(camera, source, grid)
 
 
 def seen_share(camera: Camera, source: Source, grid: Grid) -> tuple[float, float]:
