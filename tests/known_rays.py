@@ -15,11 +15,10 @@ from lfpiv_cli.optics.media import (
     fluid_path_to_focus,
     object_space_matrix,
 )
-from lfpiv_cli.optics.ray_bundles import in_fluid, refracted, trace_in
+from lfpiv_cli.optics.ray_bundles import ROUNDING_MM, in_fluid, refracted, trace_in
 from lfpiv_cli.optics.shapes import Vector, dot, plus, scaled
 from lfpiv_cli.optics.surfaces import Faces, meet
 from lfpiv_cli.optics.tracing import exact_slope
-from lfpiv_cli.simd.faces import ROUNDING_MM
 
 
 def slopes_equivalent(

@@ -18,6 +18,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from lfpiv_cli.particles.cells import covered_share
+from lfpiv_cli.particles.micro_images import GAUSS_AT, GAUSS_WEIGHT, LONGEST, SMALLEST_SHARE
 from lfpiv_cli.particles.refraction import Bend, bend_of, displaced, is_seen
 from lfpiv_cli.particles.response import (
     Along,
@@ -32,7 +33,6 @@ from lfpiv_cli.particles.response import (
     seen_moves,
 )
 from lfpiv_cli.particles.view import View
-from lfpiv_cli.simd.micro_images import GAUSS_AT, GAUSS_WEIGHT, LONGEST, SMALLEST_SHARE
 
 Floats = NDArray[np.float64]
 

@@ -31,11 +31,11 @@ from lfpiv_cli.verbs.reconstruct import reconstruct_files as reconstruct_images
 from lfpiv_cli.weights import strip_blocks
 from lfpiv_cli.weights.build import blur_radius_mm, factorise_through
 from lfpiv_cli.weights.columns import OnDemandOperator, operator_of, seen_share
+from lfpiv_cli.weights.kernels import STRIP
 from lfpiv_cli.weights.model import Weights, behind_transmission
 from lfpiv_cli.weights.quadrature import RayCount, count_rays, integrate_columns, sampling_error
 from lfpiv_cli.weights.scene import aimed_misfit_mm, curved_padding, lit_voxels, places_on_array
 from lfpiv_cli.weights.strip_fits import DEGREE_ALONG, evenly_spread, fit_axis, fit_part, mixed_shares, strip_rays
-from lfpiv_cli.weights.strip_kernels import STRIP
 from lfpiv_cli.weights.strips import StripOperator
 
 VOXEL = (0.1, 0.1, 0.1)

@@ -1,91 +1,78 @@
-"""The vectorised inner loops of the correlation against their plain twins."""
+"""The inner loops of the correlation against sums in double precision: float32 rounding is all that they differ by."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
-from numba import njit
+from lfpiv_cli.flow.maps import map_sums, margins
 
-from lfpiv_cli.simd import block_sums
-from lfpiv_cli.simd.block_sums import FEW_SHIFTS, MANY_SHIFTS, MOMENTS, MOST_TAPS, NEIGHBOURS
-from lfpiv_cli.simd.vectors import LANES
-
-# Fused multiply-adds round once where the twins round twice.
-ROUNDING = {"rtol": 1e-5, "atol": 1e-5}
+from lfpiv_cli.flow.deformation import MOST_TAPS, NEIGHBOURS, gather_taps, interpolate
+from lfpiv_cli.flow.moments import MOMENTS, pair_moments
+from lfpiv_cli.flow.windows import layout_windows
 
 
-@njit
-def interpolated(out, to, a, b, places, weights, taps):
-    block_sums.interpolate(out, to, a, b, places, weights, taps)
+def spline(s: np.ndarray) -> np.ndarray:
+    """Return the cubic B-spline."""
+    outer, inner = (np.maximum(0.0, reach - np.abs(s)) ** 3 for reach in (2.0, 1.0))
+    return (outer - 4.0 * inner) / 6.0
 
 
-@njit
-def weighted(weights, at, places, places_at, low, taps):
-    block_sums.spline_weights(weights, at, places, places_at, low, taps)
-
-
-@njit
-def multiplied(out, to, a, b, places, extent, shifts):
-    block_sums.products(out, to, a, b, places, extent, shifts)
-
-
-@njit
-def gathered(out, to, a, b, valid, places, extent):
-    block_sums.moments(out, to, a, b, valid, places, extent)
-
-
-@njit
-def extremes(places, at):
-    return block_sums.range_of_all(places, at)
-
-
-@pytest.mark.parametrize("taps_x", range(1, MOST_TAPS + 1))
-def test_interpolation_equals_its_reference(taps_x: int, rng: np.random.Generator) -> None:
-    a, b = rng.standard_normal((2, 3000), np.float32)
-    weights = rng.random((3 + 4 + taps_x) * NEIGHBOURS, np.float32)
-    found, expected = np.zeros((2, 5 + 2 * NEIGHBOURS), np.float32)
-    places = ((3, NEIGHBOURS + 1), a, b, (1503, 400, 20), weights, (-1, -2, 0, 3, 4, taps_x))
-    interpolated(found, *places)
-    block_sums.interpolate_reference(expected, *places)
-    np.testing.assert_allclose(found, expected, **ROUNDING)
-
-
-@pytest.mark.parametrize(("low", "taps", "places"), [(-2, 5, (-1.0, 1.0)), (-3, 4, (-2.0, -1.0)), (0, 4, (1.0, 2.0))])
-def test_spline_weights_equal_their_reference_and_sum_to_one(
-    low: int, taps: int, places: tuple[float, float], rng: np.random.Generator
+@pytest.mark.parametrize(("spread", "fewer"), [((0.2, 0.7), False), ((-1.9, 2.0), False), ((-4.0, 4.0), True)])
+def test_interpolation_sums_b_splines_at_mirrored_places(
+    spread: tuple[float, float], fewer: bool, rng: np.random.Generator
 ) -> None:
-    places = rng.uniform(*places, 3 * NEIGHBOURS).astype(np.float32)
-    found, expected = np.zeros((2, 7 * NEIGHBOURS), np.float32)
-    weighted(found, NEIGHBOURS, places, 5, low, taps)
-    block_sums.spline_weights_reference(expected, NEIGHBOURS, places, 5, low, taps)
-    np.testing.assert_allclose(found, expected, **ROUNDING)
-    np.testing.assert_allclose(found.reshape(7, NEIGHBOURS).sum(axis=0), 1.0, atol=1e-6)
+    a, b = rng.standard_normal((2, 19 * 21 * 80), np.float32)
+    moved = rng.uniform(*spread, (3, 3 * NEIGHBOURS)).astype(np.float32)
+    weights, sums = np.zeros((3, MOST_TAPS * NEIGHBOURS), np.float32), np.zeros((2, NEIGHBOURS), np.float32)
+    width, taps = gather_taps(moved, 5, weights)
+    assert (width < NEIGHBOURS) == fewer
+    at, plane, row = 9 * 21 * 80 + 10 * 80 + 30, 21 * 80, 80
+    interpolate(sums, (a, b), (at, plane, row), weights, taps)
+    steps = np.arange(-6, 7)
+    away = steps[:, None, None] * plane + steps[:, None] * row + steps
+    for k in range(width):
+        x, y, z = (spline(steps - float(moved[axis, 5 + k])) for axis in range(3))
+        share = z[:, None, None] * y[:, None] * x
+        # float32 sums of up to 512 terms; taps that weigh less than 2e-7 are left out
+        assert sums[0, k] == pytest.approx(np.sum(share * a[at + k - away]), abs=1e-5)
+        assert sums[1, k] == pytest.approx(np.sum(share * b[at + k + away]), abs=1e-5)
 
 
-@pytest.mark.parametrize("shifts", [FEW_SHIFTS, MANY_SHIFTS])
-def test_products_equal_their_reference(shifts: int, rng: np.random.Generator) -> None:
-    a, b = rng.standard_normal((2, 5000), np.float32)
-    found, expected = np.zeros((2, 3 + 6 * LANES), np.float32)
-    places = ((3, LANES + 1), a, b, (2000, 400, 20), (3, 4), (-421, shifts))
-    multiplied(found, *places)
-    block_sums.products_reference(expected, *places)
-    np.testing.assert_allclose(found, expected, **ROUNDING)
+@pytest.mark.parametrize("radius", [1, 2, 4])
+def test_products_are_summed_over_windows_for_every_shift(radius: int, rng: np.random.Generator) -> None:
+    a, b = rng.standard_normal((2, 5, 6, 80), np.float32)
+    layout = layout_windows((80, 6, 5), (70, 4, 3), (0.5, 0.5, 0.5))
+    before, after = margins(layout, a.shape, radius)
+    padded_a, padded_b = (np.pad(one, list(zip(before, after, strict=True))) for one in (a, b))
+    sums = map_sums(padded_a, padded_b, layout, before, radius)
+    places = rng.integers(0, 2 * radius + 1, (20, 3))
+    first = np.add(before, layout.first[::-1])
+    here = tuple(slice(low, low + size) for low, size in zip(first, layout.size[::-1], strict=True))
+    assert sums.blocks.per_window[:2] == (1, 1)
+    for place in places:
+        shift = place - radius
+        there, back = (
+            tuple(slice(s.start + k, s.stop + k) for s, k in zip(here, sign * shift, strict=True)) for sign in (1, -1)
+        )
+        wide_a, wide_b = padded_a.astype(np.float64), padded_b.astype(np.float64)
+        expected = np.sum(wide_a[here] * wide_b[there] + wide_a[back] * wide_b[here])
+        assert sums.products[0, 0, 0][tuple(place)] == pytest.approx(expected, abs=2e-4)
 
 
-def test_moments_equal_their_reference(rng: np.random.Generator) -> None:
-    a, b = rng.standard_normal((2, 5000), np.float32)
-    valid = (rng.random(5000) < 0.9).astype(np.uint8)
-    found, expected = np.zeros((2, 3 + MOMENTS * (LANES + 1)), np.float32)
-    places = ((3, LANES + 1), a, b, valid, (2000, 400, 20), (3, 4))
-    gathered(found, *places)
-    block_sums.moments_reference(expected, *places)
-    np.testing.assert_allclose(found, expected, **ROUNDING)
-
-
-@pytest.mark.parametrize("extreme", range(NEIGHBOURS))
-def test_extremes_are_those_of_sixteen(extreme: int, rng: np.random.Generator) -> None:
-    places = rng.random(3 * NEIGHBOURS, np.float32)
-    places[4 + extreme] = -3.0
-    places[4 + (extreme + 7) % NEIGHBOURS] = 5.0
-    places[4 + NEIGHBOURS] = 9.0
-    assert extremes(places, 4) == (-3.0, 5.0)
+def test_moments_are_those_of_gradient_mean_and_difference(rng: np.random.Generator) -> None:
+    a, b = rng.standard_normal((2, 6, 7, 12), np.float32)
+    valid = (rng.random(a.shape) < 0.95).astype(np.uint8)
+    layout = layout_windows((10, 5, 4), (10, 5, 4), (0.0, 0.0, 0.0))
+    found = pair_moments(a, b, valid, layout, (1, 1, 1)).sum(axis=(0, 1, 2))
+    wide_a, wide_b = a.astype(np.float64), b.astype(np.float64)
+    inner = (slice(1, -1),) * 3
+    gradients = [0.5 * (np.roll(wide_a + wide_b, -1, k) - np.roll(wide_a + wide_b, 1, k)) / 2.0 for k in (2, 1, 0)]
+    slopes = [0.25 * (np.roll(wide_b - wide_a, -1, k) - np.roll(wide_b - wide_a, 1, k)) for k in (2, 1, 0)]
+    kept = valid.copy()
+    for k in range(3):
+        kept &= np.roll(valid, 1, k) & np.roll(valid, -1, k)
+    q, r = [*gradients, 0.5 * (wide_a + wide_b)], wide_b - wide_a
+    pairs = [(q[i], q[j]) for i in range(4) for j in range(i, 4)] + [(one, r) for one in q] + [(s, s) for s in slopes]
+    expected = [np.sum((one * other * kept)[inner]) for one, other in pairs]
+    assert len(expected) == MOMENTS
+    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-4)

@@ -50,16 +50,16 @@ from lfpiv_cli.optics.media import Media, Window
 from lfpiv_cli.optics.surfaces import SURFACES
 from lfpiv_cli.optics.tracing import ObjectSpace
 from lfpiv_cli.reference import Reference
-from lfpiv_cli.simd.combine import COEFFICIENTS
+from lfpiv_cli.simd import COEFFICIENTS
 from lfpiv_cli.weights.axis import AxisWeights
 from lfpiv_cli.weights.build import axis_optics
 from lfpiv_cli.weights.columns import ColumnOperator, OnDemandOperator
+from lfpiv_cli.weights.kernels import SLAB, STRIP, Blocks
 from lfpiv_cli.weights.lens_cells import AxisOptics, aperture_mask, micro_image_cells
 from lfpiv_cli.weights.model import Weights, WeightsOperator, behind_transmission
 from lfpiv_cli.weights.operators import BrickOperator, Column, FactorisedOperator
 from lfpiv_cli.weights.quadrature import Columns
 from lfpiv_cli.weights.scene import Source
-from lfpiv_cli.weights.strip_kernels import SLAB, STRIP, Blocks
 from lfpiv_cli.weights.strips import StripOperator
 
 FORMAT = "lfpiv-weights"

@@ -19,12 +19,15 @@ from scipy.interpolate import CubicSpline
 
 from lfpiv_cli.arrays import Floats
 from lfpiv_cli.flow.windows import Triple, WindowLayout
-from lfpiv_cli.simd.block_sums import MOST_TAPS, NEIGHBOURS, interpolate, range_of_all, range_reference, spline_weights
-from lfpiv_cli.threads import share_out
+from lfpiv_cli.threads import COUNT_NO_REFERENCES, share_out
 
 # Sources lie between the first and the last voxel's centre: the four taps of a cubic B-spline reach one coefficient
 # beyond these, and a fifth of weight zero another.
 SPLINE_PAD = 2
+# Neighbours along x are interpolated together with the taps of all of them, so many along an axis at most: theirs
+# along x are taken four at a time.
+NEIGHBOURS = 16
+MOST_TAPS, TAPS_AT_ONCE = 8, 4
 # Neighbours beyond the end of a row are interpolated and dropped; so far they may read.
 SLACK = 2 * NEIGHBOURS
 # A tap whose B-spline ends closer than this to a place weighs less than 2e-7 there and is left out: in fluid at rest,
@@ -207,10 +210,8 @@ def deform_planes(
         for axis in range(3):
             np.dot(np.dot(along_y, at_windows[axis]), along_x, half_here[axis])
         moved = np.empty((3, shape[2] + NEIGHBOURS), dtype=np.float32)
-        flat_moved = moved.reshape(moved.size)
-        weights = np.empty(3 * MOST_TAPS * NEIGHBOURS, dtype=np.float32)
-        lines = np.empty((2, shape[2] + NEIGHBOURS), dtype=np.float32)
-        flat_lines = lines.reshape(lines.size)
+        weights = np.empty((3, MOST_TAPS * NEIGHBOURS), dtype=np.float32)
+        sums = np.empty((2, NEIGHBOURS), dtype=np.float32)
         for y in range(shape[1]):
             target = (z + before[0], y + before[1])
             here = slice(before[2], before[2] + shape[2])
@@ -224,52 +225,106 @@ def deform_planes(
                     seen_b = mask[int(np.floor(z + w + 0.5)), int(np.floor(y + v + 0.5)), int(np.floor(x + u + 0.5))]
                     seen[x] &= np.uint8(seen_a and seen_b)
             begin = SLACK + (z + SPLINE_PAD) * plane + (y + SPLINE_PAD) * row + SPLINE_PAD
-            at = begin
-            while at < begin + shape[2]:
-                x = at - begin
-                width, taps = gather_taps(flat_moved, moved.shape[1], x, weights)
-                interpolate(flat_lines, (x, lines.shape[1]), flat_a, flat_b, (at, plane, row), weights, taps)
-                at += width
-            copy_seen(lines[0], seen, deformed_a[target][here])
-            copy_seen(lines[1], seen, deformed_b[target][here])
+            row_a, row_b, x = deformed_a[target][here], deformed_b[target][here], 0
+            while x < shape[2]:
+                width, taps = gather_taps(moved, x, weights)
+                interpolate(sums, (flat_a, flat_b), (begin + x, plane, row), weights, taps)
+                for k in range(min(width, shape[2] - x)):
+                    row_a[x + k] = sums[0, k] * np.float32(seen[x + k])
+                    row_b[x + k] = sums[1, k] * np.float32(seen[x + k])
+                x += width
 
 
-@njit(cache=True)
-def copy_seen(line: NDArray[np.float32], seen: NDArray[np.uint8], target: NDArray[np.float32]) -> None:
-    """Copy what is seen of a row, and zero where it is not."""
-    for x in range(seen.size):
-        target[x] = line[x] * np.float32(seen[x])
-
-
-@njit(cache=True)
+@njit(cache=True, **COUNT_NO_REFERENCES)
 def gather_taps(
-    moved: NDArray[np.float32], length: int, x: int, weights: NDArray[np.float32]
+    moved: NDArray[np.float32], x: int, weights: NDArray[np.float32]
 ) -> tuple[int, tuple[int, int, int, int, int, int]]:
     """Write the weights of the taps that the neighbours from `x` on need; return how many neighbours, and the taps.
 
     These are the lowest along z, y, x and how many follow along each. As many neighbours as `MOST_TAPS` serve: where
-    displacements differ too much for all, fewer are taken at once. `moved` is `length` long an axis.
+    displacements differ too much for all, fewer are taken at once.
+
+    Parameters
+    ----------
+    moved, weights : along x, y, z
     """
     width = 2 * NEIGHBOURS
     while True:
         width //= 2
-        low_x, taps_x = taps_of(moved, x, width)
-        low_y, taps_y = taps_of(moved, length + x, width)
-        low_z, taps_z = taps_of(moved, 2 * length + x, width)
+        low_x, taps_x = taps_of(moved[0, x : x + width])
+        low_y, taps_y = taps_of(moved[1, x : x + width])
+        low_z, taps_z = taps_of(moved[2, x : x + width])
+        taps_x = -(-taps_x // TAPS_AT_ONCE) * TAPS_AT_ONCE
         if max(taps_x, taps_y, taps_z) <= MOST_TAPS:
             break
-    spline_weights(weights, 0, moved, 2 * length + x, low_z, taps_z)
-    spline_weights(weights, taps_z * NEIGHBOURS, moved, length + x, low_y, taps_y)
-    spline_weights(weights, (taps_z + taps_y) * NEIGHBOURS, moved, x, low_x, taps_x)
+    write_splines(moved[0, x:], low_x, taps_x, weights[0])
+    write_splines(moved[1, x:], low_y, taps_y, weights[1])
+    write_splines(moved[2, x:], low_z, taps_z, weights[2])
     return width, (low_z, low_y, low_x, taps_z, taps_y, taps_x)
 
 
-@njit(cache=True)
-def taps_of(places: NDArray[np.float32], at: int, width: int) -> tuple[int, int]:
-    """Return the lowest tap whose B-spline matters at some of `width` places, and how many there are from it on."""
-    low, high = range_of_all(places, at) if width == NEIGHBOURS else range_reference(places, at, width)
+@njit(cache=True, fastmath=True, **COUNT_NO_REFERENCES)
+def taps_of(places: NDArray[np.float32]) -> tuple[int, int]:
+    """Return the lowest tap whose B-spline matters at some of the places, and how many there are from it on."""
+    low = high = places[0]
+    for k in range(places.size):
+        low, high = min(low, places[k]), max(high, places[k])
     first = int(np.floor(low + np.float32(NEGLIGIBLE))) - 1
     return first, int(np.ceil(high - np.float32(NEGLIGIBLE))) + 2 - first
+
+
+@njit(cache=True, fastmath=True, **COUNT_NO_REFERENCES)
+def write_splines(places: NDArray[np.float32], low: int, taps: int, weights: NDArray[np.float32]) -> None:
+    """Write the cubic B-splines B centred on each tap at `NEIGHBOURS` places, tap after tap from `low` on.
+
+    B(s) = [max(0, 2 - |s|)^3 - 4 max(0, 1 - |s|)^3] / 6.
+    """
+    for tap in range(taps):
+        centre, value = np.float32(low + tap), weights[tap * NEIGHBOURS :]
+        for k in range(NEIGHBOURS):
+            away = abs(places[k] - centre)
+            outer, inner = max(np.float32(2.0) - away, np.float32(0.0)), max(np.float32(1.0) - away, np.float32(0.0))
+            value[k] = (outer * outer * outer - np.float32(4.0) * inner * inner * inner) * np.float32(1.0 / 6.0)
+
+
+@njit(cache=True, fastmath=True, **COUNT_NO_REFERENCES)
+def interpolate(
+    sums: NDArray[np.float32],
+    volumes: tuple[NDArray[np.float32], NDArray[np.float32]],
+    place: tuple[int, int, int],
+    weights: NDArray[np.float32],
+    taps: tuple[int, int, int, int, int, int],
+) -> None:
+    """Interpolate two volumes a and b at mirrored places: b towards the taps, a as far away in the opposite direction.
+
+    Parameters
+    ----------
+    sums : (2, NEIGHBOURS) of a and b, written
+    volumes, place : flat; element of the first neighbour, and the steps to the next plane and row
+    weights, taps : of `gather_taps`
+    """
+    a, b = volumes
+    at, plane, row = place
+    low_z, low_y, low_x, taps_z, taps_y, taps_x = taps
+    total = sums.reshape(sums.size)
+    for k in range(2 * NEIGHBOURS):
+        total[k] = 0.0
+    for tap_z in range(taps_z):
+        of_z = weights[2, tap_z * NEIGHBOURS :]
+        for tap_y in range(taps_y):
+            of_y = weights[1, tap_y * NEIGHBOURS :]
+            for tap_x in range(0, taps_x, TAPS_AT_ONCE):
+                of_x = weights[0, tap_x * NEIGHBOURS :]
+                away = (low_z + tap_z) * plane + (low_y + tap_y) * row + low_x + tap_x
+                ahead, back = b[at + away :], a[at - away - 3 :]
+                for k in range(NEIGHBOURS):
+                    both = of_z[k] * of_y[k]
+                    first, second = both * of_x[k], both * of_x[NEIGHBOURS + k]
+                    third, fourth = both * of_x[2 * NEIGHBOURS + k], both * of_x[3 * NEIGHBOURS + k]
+                    total[k] += first * back[k + 3] + second * back[k + 2] + third * back[k + 1] + fourth * back[k]
+                    total[NEIGHBOURS + k] += (
+                        first * ahead[k] + second * ahead[k + 1] + third * ahead[k + 2] + fourth * ahead[k + 3]
+                    )
 
 
 @njit(cache=True)

@@ -19,14 +19,10 @@ import numpy as np
 from numba import njit
 
 from lfpiv_cli.arrays import Floats
-from lfpiv_cli.flow.sums import cells_of
+from lfpiv_cli.flow.sums import MOMENTS, PRODUCTS, UNKNOWNS, cells_of
 from lfpiv_cli.flow.windows import Triple, WindowLayout, triple
-from lfpiv_cli.simd.block_sums import MOMENTS
 from lfpiv_cli.threads import share_out
 
-# Three components and the gain. Moments are those of their derivatives, and those of these with B - A.
-UNKNOWNS = 4
-PRODUCTS = UNKNOWNS * (UNKNOWNS + 1) // 2
 # A group is at least this many standard deviations of a particle image long: smaller ones share their particles, and
 # the spread of what they say is then too small.
 GROUP_SIGMAS = 2.0

@@ -26,15 +26,21 @@ from numpy.typing import NDArray
 from lfpiv_cli.arrays import Floats
 from lfpiv_cli.flow.windows import Triple, WindowLayout, triple
 from lfpiv_cli.robust import of_half_the_sum
-from lfpiv_cli.simd.block_sums import FEW_SHIFTS, MANY_SHIFTS, MOMENTS, products
-from lfpiv_cli.simd.block_sums import moments as lane_moments
-from lfpiv_cli.simd.vectors import LANES
-from lfpiv_cli.threads import in_threads, share_out
+from lfpiv_cli.threads import COUNT_NO_REFERENCES, in_threads, share_out
 
+# Three components and the gain. Moments are those of their derivatives, and those of these with B - A.
+UNKNOWNS = 4
+PRODUCTS = UNKNOWNS * (UNKNOWNS + 1) // 2
+# And the squares of the slopes of their difference.
+MOMENTS = PRODUCTS + UNKNOWNS + 3
 # Blocks narrower than this cost more in sums of sums than the products they save.
 SMALLEST_BLOCK = 4
 # Cells along an axis of a window, at least, where it has as many voxels: groups enough for a variance.
 CELLS_PER_WINDOW = 4
+# Columns whose products are summed for all shifts before the next ones': their voxels stay in the fastest cache. And
+# shifts along x that share what is read: with five a radius of 2 takes one pass over a row.
+COLUMNS = 64
+FEW_SHIFTS, MANY_SHIFTS = 3, 5
 # A window whose energy is below this share of the brightest one's is empty: what the splines carry into empty space
 # reaches amplitudes of 1e-5.
 SMALLEST_ENERGY = 1e-9
@@ -43,6 +49,7 @@ SMALLEST_ENERGY = 1e-9
 SMALLEST_AMPLITUDE = 0.07
 
 
+Row = NDArray[np.float32]
 Starts = tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]
 Weights = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]
 
@@ -86,15 +93,10 @@ def cells_of(layout: WindowLayout, least: int = CELLS_PER_WINDOW, alone: Sequenc
 
 
 def margins(layout: WindowLayout, shape_zyx: Triple, radius: int) -> tuple[Triple, Triple]:
-    """Return how many voxels of zeros windows shifted by `radius` need before and after the volume, (z, y, x).
-
-    Along x there are at least `LANES` voxels from the first window's on, which are multiplied at once.
-    """
+    """Return how many voxels of zeros windows shifted by `radius` need before and after the volume, (z, y, x)."""
     before, after = [], []
     for axis, voxels in zip((2, 1, 0), shape_zyx, strict=True):
         last = layout.first[axis] + (layout.count[axis] - 1) * layout.step[axis] + layout.size[axis]
-        if axis == 0:
-            last = max(last, layout.first[axis] + LANES)
         before.append(max(0, radius - layout.first[axis]))
         after.append(max(0, last + radius - voxels))
     return triple(before), triple(after)
@@ -433,31 +435,64 @@ def sum_products(
     radius = shifts // 2
     row, plane = a.shape[2], a.shape[1] * a.shape[2]
     flat_a, flat_b = a.reshape(a.size), b.reshape(b.size)
-    length = max(LANES, start[2][-1] + size[2][-1])
+    length = start[2][-1] + size[2][-1]
     together = MANY_SHIFTS if shifts >= MANY_SHIFTS else FEW_SHIFTS
+    summed = np.empty((MANY_SHIFTS, COLUMNS), dtype=np.float32)
+    target = summed.reshape(summed.size)
     for job in range(part[0], part[1]):
         bz, by = job // count[1], job % count[1]
         begin = (first[0] + start[0][bz]) * plane + (first[1] + start[1][by]) * row + first[2]
         room = np.empty((3, shifts**3 * length), dtype=np.float32)
         flat, spare, sums = room[0], room[1], room[2]
-        # All shifts of a few columns before the next ones: their voxels then stay in the fastest cache.
-        for lane in range(0, length, LANES):
-            # The last lanes, and the last shifts below, begin early enough to end with the others.
-            x = min(lane, length - LANES)
-            for sz in range(shifts):
-                for sy in range(shifts):
-                    for group in range(0, shifts, together):
-                        sx = min(group, shifts - together)
-                        at = ((sz * shifts + sy) * shifts + sx) * length + x
-                        shift = (sz - radius) * plane + (sy - radius) * row + sx - radius
-                        places, shifted = (begin + x, plane, row), (shift, together)
-                        products(flat, (at, length), flat_a, flat_b, places, (size[0][bz], size[1][by]), shifted)
+        for x in range(0, length, COLUMNS):
+            columns = min(COLUMNS, length - x)
+            for group in range(0, shifts**3, shifts):
+                sz, sy = group // shifts // shifts, group // shifts % shifts
+                for column in range(0, shifts, together):
+                    # The last shifts begin early enough to end with the others.
+                    sx = min(column, shifts - together)
+                    shift = (sz - radius) * plane + (sy - radius) * row + sx - radius
+                    summed[:] = 0.0
+                    for z in range(size[0][bz]):
+                        for y in range(size[1][by]):
+                            here = begin + z * plane + y * row + x
+                            a_here, b_here, b_there = flat_a[here:], flat_b[here:], flat_b[here + shift :]
+                            a_back = flat_a[here - shift - together + 1 :]
+                            # Numbers of shifts that the compiler knows: it then writes out their loop.
+                            if together == MANY_SHIFTS:
+                                add_products(target, a_here, b_here, b_there, a_back, columns, MANY_SHIFTS)
+                            else:
+                                add_products(target, a_here, b_here, b_there, a_back, columns, FEW_SHIFTS)
+                    for m in range(together):
+                        line, found_line = flat[(group + sx + m) * length + x :], summed[m]
+                        for k in range(columns):
+                            line[k] = found_line[k]
         sum_ahead(flat, spare, size[2][0], sums)
         lines = sums.reshape(-1, length)
         for kx in range(count[2]):
             window = found[bz, by, kx].reshape(lines.shape[0])
             for shift in range(window.size):
                 window[shift] = lines[shift, start[2][kx]]
+
+
+@njit(cache=True, fastmath=True, **COUNT_NO_REFERENCES)
+def add_products(
+    target: NDArray[np.float32],
+    a: NDArray[np.float32],
+    b: NDArray[np.float32],
+    b_there: NDArray[np.float32],
+    a_back: NDArray[np.float32],
+    columns: int,
+    shifts: int,
+) -> None:
+    """Add a(x) b(x + s) + a(x - s) b(x) of one row for shifts that follow each other, `COLUMNS` apart in `target`.
+
+    `b_there` begins at the first shift, `a_back` at the last.
+    """
+    for x in range(columns):
+        a_here, b_here = a[x], b[x]
+        for m in range(shifts):
+            target[m * COLUMNS + x] += a_here * b_there[x + m] + a_back[x + shifts - 1 - m] * b_here
 
 
 @njit(cache=True, nogil=True)
@@ -480,21 +515,89 @@ def sum_cells(
     count = found.shape[:3]
     row, plane = a.shape[2], a.shape[1] * a.shape[2]
     flat_a, flat_b, flat_valid = a.reshape(a.size), b.reshape(b.size), valid.reshape(valid.size)
-    length = max(LANES, start[2][-1] + size[2][-1])
+    length = start[2][-1] + size[2][-1]
+    room = np.empty((MOMENTS + UNKNOWNS + 5, length), dtype=np.float32)
+    columns, rest, kept = room[:MOMENTS], room[-2], room[-1]
+    known, slopes = room[MOMENTS : MOMENTS + UNKNOWNS], room[MOMENTS + UNKNOWNS : -2]
     for job in range(part[0], part[1]):
         cz, cy = job // count[1], job % count[1]
         begin = (first[0] + start[0][cz]) * plane + (first[1] + start[1][cy]) * row + first[2]
         # Summed over the planes and rows of the cells first, many columns at once; float32 serves for so few.
-        columns = np.empty((MOMENTS, length), dtype=np.float32)
-        flat = columns.reshape(columns.size)
-        for lane in range(0, length, LANES):
-            # The last lanes begin early enough to end with the others.
-            x = min(lane, length - LANES)
-            places = (begin + x, plane, row)
-            lane_moments(flat, (x, length), flat_a, flat_b, flat_valid, places, (size[0][cz], size[1][cy]))
+        columns[:] = 0.0
+        for z in range(size[0][cz]):
+            for y in range(size[1][cy]):
+                here = begin + z * plane + y * row
+                write_voxels(flat_a[here:], flat_b[here:], flat_valid[here:], known[3], rest, kept)
+                for axis in range(3):
+                    step = 1 if axis == 0 else row if axis == 1 else plane
+                    before, after = here - step, here + step
+                    write_slopes(
+                        (flat_a[before:], flat_a[after:]),
+                        (flat_b[before:], flat_b[after:]),
+                        (flat_valid[before:], flat_valid[after:]),
+                        (known[axis], slopes[axis], kept),
+                    )
+                moment = 0
+                for i in range(UNKNOWNS):
+                    multiply(known[i], kept)
+                for i in range(UNKNOWNS):
+                    for j in range(i, UNKNOWNS):
+                        add_product(columns[moment], known[i], known[j])
+                        moment += 1
+                for i in range(UNKNOWNS):
+                    add_product(columns[PRODUCTS + i], known[i], rest)
+                for i in range(3):
+                    multiply(slopes[i], kept)
+                    add_product(columns[PRODUCTS + UNKNOWNS + i], slopes[i], slopes[i])
         for cx in range(count[2]):
             for moment in range(MOMENTS):
                 total = 0.0
                 for x in range(start[2][cx], start[2][cx] + size[2][cx]):
                     total += columns[moment, x]
                 found[cz, cy, cx, moment] = total
+
+
+@njit(cache=True, **COUNT_NO_REFERENCES)
+def write_voxels(a: Row, b: Row, valid: NDArray[np.uint8], mean: Row, rest: Row, kept: Row) -> None:
+    """Write the mean of two rows, their difference and which voxels are valid."""
+    for x in range(kept.size):
+        mean[x] = np.float32(0.5) * (a[x] + b[x])
+        rest[x] = b[x] - a[x]
+        kept[x] = np.float32(valid[x])
+
+
+@njit(cache=True, **COUNT_NO_REFERENCES)
+def write_slopes(
+    a: tuple[Row, Row],
+    b: tuple[Row, Row],
+    valid: tuple[NDArray[np.uint8], NDArray[np.uint8]],
+    out: tuple[Row, Row, Row],
+) -> None:
+    """Write the central differences of the mean and of half the difference, from the rows before and after each.
+
+    Voxels with a neighbour that is not valid are struck out of the last of `out`.
+    """
+    a_before, a_after = a
+    b_before, b_after = b
+    valid_before, valid_after = valid
+    of_mean, of_difference, kept = out
+    for x in range(kept.size):
+        rise_a, rise_b = a_after[x] - a_before[x], b_after[x] - b_before[x]
+        of_mean[x] = np.float32(0.25) * (rise_a + rise_b)
+        of_difference[x] = np.float32(0.25) * (rise_b - rise_a)
+    for x in range(kept.size):
+        kept[x] *= np.float32(valid_before[x] & valid_after[x])
+
+
+@njit(cache=True, **COUNT_NO_REFERENCES)
+def multiply(target: Row, factor: Row) -> None:
+    """Multiply a row by another."""
+    for x in range(target.size):
+        target[x] *= factor[x]
+
+
+@njit(cache=True, fastmath=True, **COUNT_NO_REFERENCES)
+def add_product(target: Row, one: Row, other: Row) -> None:
+    """Add the product of two rows to a row."""
+    for x in range(target.size):
+        target[x] += one[x] * other[x]

@@ -9,8 +9,6 @@ refraction:
     d' = r d + (c' - r c) n,    c'^2 = 1 - r^2 (1 - c^2)
 
 A ray that misses a face, is totally reflected, or ends outside the fluid is told by a flag, never by an exception.
-Arrays of rays are aimed as many at once as a register of the vector unit holds; faces that are given by their heights
-are met by one ray after the other.
 """
 
 from __future__ import annotations
@@ -20,27 +18,12 @@ from numba import njit
 from numpy.typing import NDArray
 
 from lfpiv_cli.arrays import Floats
-from lfpiv_cli.optics.shapes import Reliefs, Vector, dot, plus, row, scaled
+from lfpiv_cli.optics.shapes import Vector, dot, plus, scaled
 from lfpiv_cli.optics.surfaces import Faces, height_behind, meet, normal_change
-from lfpiv_cli.simd.faces import (
-    AIM_ROWS,
-    LENS_X,
-    LENS_Y,
-    MISSED,
-    POINT_X,
-    POINT_Y,
-    POINT_Z,
-    ROUNDING_MM,
-    SHARE,
-    SLOPE_X,
-    SLOPE_Y,
-    STEP_X,
-    STEP_Y,
-    aim_lanes,
-)
-from lfpiv_cli.simd.vectors import DOUBLES
 from lfpiv_cli.threads import COUNT_NO_REFERENCES
 
+# What a point may lie in front of the face that it touches, and a path go backwards, by rounding.
+ROUNDING_MM = 1e-9
 # Newton's iteration for the ray through a point converges quadratically: from this near a last step reaches 1e-13 mm.
 CLOSE_MM = 1e-6
 # It takes four steps, ten close to where light grazes; the limit guards against points that no ray reaches.
@@ -212,57 +195,12 @@ Flags = NDArray[np.bool_]
 @njit(cache=True)
 def aim_all(faces: Faces, points: Floats, crossing: Floats) -> tuple[Floats, Flags]:
     """Return `aim` from each point through each crossing: slopes (n, 2) and whether they are valid (n,)."""
-    return _aim_all(faces.reliefs, faces, points, crossing)
-
-
-# As in `surfaces`: what takes the heights as an argument of its own is compiled without them where there are none.
-@njit(cache=True)
-def _aim_all(reliefs: Reliefs | None, faces: Faces, points: Floats, crossing: Floats) -> tuple[Floats, Flags]:
-    slopes, valid = np.full((len(points), 2), np.nan), np.zeros(len(points), dtype=np.bool_)
-    if reliefs is not None:
-        for i in range(len(points)):
-            slopes[i, 0], slopes[i, 1], valid[i] = aim(
-                faces, points[i, 0], points[i, 1], points[i, 2], crossing[i, 0], crossing[i, 1]
-            )
-        return slopes, valid
-    # A lane whose ray is found takes the next one, so that none waits for the slowest.
-    table = np.zeros(AIM_ROWS * DOUBLES)
-    ray, steps = np.full(DOUBLES, -1), np.zeros(DOUBLES, np.int64)
-    following, running = 0, 0
-    while True:
-        for lane in range(DOUBLES):
-            while ray[lane] < 0 and following < len(points):
-                x, y, z = row(points, following)
-                if in_fluid(faces, (x, y, z)):
-                    # From where `aim` begins.
-                    distance = faces.focus_distance_mm + faces.depth_ratio * z
-                    X, Y = crossing[following, 0], crossing[following, 1]
-                    table[POINT_X * DOUBLES + lane], table[POINT_Y * DOUBLES + lane] = x, y
-                    table[POINT_Z * DOUBLES + lane] = z
-                    table[LENS_X * DOUBLES + lane], table[LENS_Y * DOUBLES + lane] = X, Y
-                    table[SLOPE_X * DOUBLES + lane], table[SLOPE_Y * DOUBLES + lane] = X / distance, Y / distance
-                    table[STEP_X * DOUBLES + lane], table[STEP_Y * DOUBLES + lane] = -x / distance, -y / distance
-                    table[MISSED * DOUBLES + lane], table[SHARE * DOUBLES + lane] = np.inf, 1.0
-                    ray[lane], steps[lane] = following, 0
-                    running += 1
-                following += 1
-        if running == 0:
-            return slopes, valid
-        aim_lanes(
-            table, faces.lens_z_mm, faces.vertices_mm, faces.normals, faces.axes, faces.curvatures_per_mm, faces.ratios
+    slopes, valid = np.empty((len(points), 2)), np.empty(len(points), dtype=np.bool_)
+    for i in range(len(points)):
+        slopes[i, 0], slopes[i, 1], valid[i] = aim(
+            faces, points[i, 0], points[i, 1], points[i, 2], crossing[i, 0], crossing[i, 1]
         )
-        for lane in range(DOUBLES):
-            i = ray[lane]
-            if i < 0:
-                continue
-            steps[lane] += 1
-            if table[MISSED * DOUBLES + lane] <= CLOSE_MM:
-                slopes[i, 0] = table[SLOPE_X * DOUBLES + lane] + table[STEP_X * DOUBLES + lane]
-                slopes[i, 1] = table[SLOPE_Y * DOUBLES + lane] + table[STEP_Y * DOUBLES + lane]
-                valid[i] = True
-            if valid[i] or steps[lane] == MOST_STEPS:
-                ray[lane] = -1
-                running -= 1
+    return slopes, valid
 
 
 @njit(cache=True)

@@ -20,8 +20,7 @@ from lfpiv_cli.optics.tracing import slope_ratio
 from lfpiv_cli.particles.refraction import Bend, displaced
 from lfpiv_cli.particles.response import Along, Projection, lenses_of, project
 from lfpiv_cli.particles.view import View
-from lfpiv_cli.simd.combine import ROWS, combine_rows
-from lfpiv_cli.simd.vectors import LANES
+from lfpiv_cli.simd import LANES, ROWS, combine_rows
 from lfpiv_cli.threads import COUNT_NO_REFERENCES
 
 # Responses along one axis: the light's, and its derivatives by the spot's place and by depth.

@@ -17,6 +17,21 @@ from numpy.typing import NDArray
 
 from lfpiv_cli.arrays import Floats
 from lfpiv_cli.particles.cells import DIRECTIONS, DISTANCES
+from lfpiv_cli.particles.micro_images import (
+    CURVED_NUMBERS,
+    DOWN,
+    JOIN_NUMBERS,
+    OF_CUBIC,
+    PATCH,
+    TABLE_SIZE,
+    WIDTH,
+    cover_row,
+    fill_profile,
+    join_curved_row,
+    join_row,
+    leave_whole,
+    take_row,
+)
 from lfpiv_cli.particles.pencil import in_row
 from lfpiv_cli.particles.refraction import Bend, is_seen
 from lfpiv_cli.particles.response import (
@@ -31,33 +46,16 @@ from lfpiv_cli.particles.response import (
     seen_moves,
 )
 from lfpiv_cli.particles.view import View
-from lfpiv_cli.simd.micro_images import (
-    CURVED_NUMBERS,
-    JOIN_NUMBERS,
-    OF_CUBIC,
-    OF_ROW,
-    PATCH,
-    PROFILE_ROWS,
-    RIM_ROWS,
-    STRIDE,
-    WHOLE,
-    cover_row,
-    fill_profile,
-    join_curved_row,
-    join_row,
-)
 from lfpiv_cli.threads import COUNT_NO_REFERENCES
 
-# A row of a micro-image is written up to the end of a register: so many entries more than there are.
-SLACK = 8
+# A row of a micro-image is written up to a whole `WIDTH`: so many entries more than there are.
+SLACK = WIDTH
 
 
 class Scratch(NamedTuple):
-    """Room for what one lens shows, see `simd.micro_images`."""
+    """Room for what one lens shows: the table of `micro_images` and its numbers; and for where each lens does."""
 
-    across: Floats
-    down: Floats
-    rim: Floats
+    table: Floats
     numbers: Floats
     lenses: NDArray[np.int64]
 
@@ -65,12 +63,8 @@ class Scratch(NamedTuple):
 @njit(cache=True)
 def scratch(capacity: int) -> Scratch:
     """Return the room for so many entries."""
-    rim = np.zeros(2 * RIM_ROWS * STRIDE)
-    rim[WHOLE : WHOLE + STRIDE] = 1.0
-    across, down = np.zeros(PROFILE_ROWS * STRIDE), np.zeros(PROFILE_ROWS * STRIDE)
-    return Scratch(
-        across, down, rim, np.zeros(max(JOIN_NUMBERS, CURVED_NUMBERS)), np.empty((capacity + 1, 5), np.int64)
-    )
+    numbers = np.zeros(max(JOIN_NUMBERS, CURVED_NUMBERS))
+    return Scratch(np.zeros(TABLE_SIZE), numbers, np.empty((capacity + 1, 5), np.int64))
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
@@ -121,7 +115,7 @@ def respond_rows(view: View, bend: Bend, pixels: NDArray[np.int32], values: Floa
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
 def _set_numbers(view: View, projection: Projection, bend: Bend, numbers: Floats) -> None:
-    """Set `JoinNumbers` of a particle, but for those that each lens has of its own."""
+    """Set the numbers of `join_row` of a particle, but for those that each lens has of its own."""
     camera, x, y = view.camera, projection.x, projection.y
     ratio = x.lever / x.scale
     width = mean_width(view, projection)
@@ -146,7 +140,7 @@ def _set_numbers(view: View, projection: Projection, bend: Bend, numbers: Floats
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
 def _set_curved_numbers(view: View, projection: Projection, bend: Bend, numbers: Floats) -> None:
-    """Set `CurvedNumbers` of a particle, but for those that each lens and each row has of its own."""
+    """Set the numbers of `join_curved_row` of a particle, but for those that each lens and each row has of its own."""
     camera, x, y = view.camera, projection.x, projection.y
     width = mean_width(view, projection)
     numbers[0], numbers[1] = x.x, y.x
@@ -197,8 +191,8 @@ def _write_lens(
     width = mean_width(view, projection)
     if _nearest(first_x, step_x, columns) + _nearest(first_y, step_y, rows) >= _far(view, width):
         return 0
-    _fill(view, x, (first_x, offset_x, gain_x), columns, room.across)
-    _fill(view, y, (first_y, offset_y, gain_y), rows, room.down)
+    _fill(view, x, (first_x, offset_x, gain_x), columns, room.table)
+    _fill(view, y, (first_y, offset_y, gain_y), rows, room.table[DOWN:])
     if bend.cubic.shape[0] > 0:
         _set_bent(view, x, bent.x, bent.gain_x, numbers[CURVED_NUMBERS - 4 :])
         _set_bent(view, y, bent.y, bent.gain_y, numbers[CURVED_NUMBERS - 3 :])
@@ -214,7 +208,7 @@ def _write_lens(
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
 def _set_bent(view: View, along: Along, bent: float, gain: float, numbers: Floats) -> None:
-    """Set along one axis what profiles change by with rays' slopes, and did already; see `JoinNumbers`."""
+    """Set along one axis what profiles change by with rays' slopes, and did already; see `join_row`."""
     place = along.lever / along.scale * along.beta
     by_x = along.stretch * (along.alpha * place - along.beta) + gain * place
     numbers[0] = along.stretch * view.camera.image_distance_mm / by_x
@@ -298,25 +292,26 @@ def _write_rows(
         DIRECTIONS - 1.001,
         inside,
     )
-    first = room.across[PATCH * STRIDE]
+    table, first = room.table, room.table[PATCH]
     at = begin
     rectangle[1], rectangle[2], rectangle[3], rectangle[4] = row + rows, -1, column + columns, -1
     for m in range(rows):
-        y = room.down[PATCH * STRIDE + m]
+        y = table[DOWN + PATCH + m]
         low, high = _columns_within(outside - y * y, first, step, columns)
         if low >= high or at + high - low + SLACK > pixels.size:
             continue
         whole_low, whole_high = _columns_within(inside - y * y, first, step, columns)
-        whole = whole_low == low and whole_high == high
-        if not whole:
-            cover_row(room.rim, room.across, (low, high - low), room.down, m, view.table, rim_numbers)
-        to = (at, (row + m) * camera.columns + column + low)
-        chosen = (low, high - low, WHOLE if whole else OF_ROW)
+        chosen = (low, high - low)
+        if whole_low == low and whole_high == high:
+            leave_whole(table, chosen)
+        else:
+            cover_row(table, chosen, m, view.table, rim_numbers)
         if cubic.shape[0] > 0:
             _set_row(cubic, tangent, y, room.numbers)
-            join_curved_row(pixels, values, to, room.across, chosen, room.down, m, room.rim, room.numbers)
+            join_curved_row(table, chosen, m, room.numbers)
         else:
-            join_row(pixels, values, to, room.across, chosen, room.down, m, room.rim, room.numbers)
+            join_row(table, chosen, m, room.numbers)
+        take_row(table, chosen, (at, (row + m) * camera.columns + column + low), pixels, values)
         at += high - low
         rectangle[1], rectangle[2] = min(rectangle[1], row + m), row + m
         rectangle[3], rectangle[4] = min(rectangle[3], column + low), max(rectangle[4], column + high - 1)
@@ -325,7 +320,7 @@ def _write_rows(
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
 def _set_row(cubic: Floats, tangent: tuple[float, float], y: float, numbers: Floats) -> None:
-    """Set what a row has of its own of `CurvedNumbers`: cubics of X without the tangents that profiles follow."""
+    """Set the cubics of X that a row has, of `join_curved_row`, without the tangents that profiles follow."""
     for k in range(2):
         at = OF_CUBIC + 4 * k
         numbers[at], numbers[at + 1], numbers[at + 2], numbers[at + 3] = in_row(cubic[k], y)

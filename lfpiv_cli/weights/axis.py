@@ -187,71 +187,64 @@ def depth_nodes(z_mm: NDArray[np.float64], depth_mm: float) -> NDArray[np.float6
 def _integrate(
     part: tuple[int, int],
     scene: AxisScene,
-    start: NDArray[np.int64],
+    start_of_row: NDArray[np.int64],
     counts: NDArray[np.int64],
     cell: NDArray[np.int32],
-    share: NDArray[np.float32],
+    share_of_cell: NDArray[np.float32],
 ) -> None:
-    """Fill `counts` (when `start` is empty) or `cell` and `share`, one plane of `part` after the other."""
-    voxels = scene.centres_mm.size
-    shares = np.zeros(scene.cell_pixel.size)
-    work = np.empty((4, MOST_CORNERS, 2))
-    for plane in range(part[0], part[1]):
-        for k in range(voxels):
-            row = plane * voxels + k
-            begin, end = _voxel_shares(scene, row, work, shares)
-            found = 0
-            for at in range(begin, end):
-                if shares[at] > SMALLEST_SHARE:
-                    if start.size:
-                        cell[start[row] + found] = at
-                        share[start[row] + found] = shares[at]
-                    found += 1
-                shares[at] = 0.0
-            counts[row] = found
+    """Fill `counts` (when `start_of_row` is empty) or also `cell` and its share, one plane of `part` after the other.
 
-
-@njit(cache=True)
-def _voxel_shares(
-    scene: AxisScene, row: int, work: NDArray[np.float64], shares: NDArray[np.float64]
-) -> tuple[int, int]:
-    """Add the shares of a row of `AxisWeights` to `shares` (cells,); return the first cell touched and the one behind.
-
-    In each strip of X the ray's place on the array is linear, x_m = alpha X - scale x + offset, right at both ends.
+    All are those of `AxisWeights`.
     """
-    plane, voxel = row // scene.centres_mm.size, row % scene.centres_mm.size
-    optics, camera = scene.optics, scene.optics.camera
+    voxels = scene.centres_mm.size
+    optics, camera, width = scene.optics, scene.optics.camera, scene.width_mm
     s_i, s_mu = camera.image_distance_mm, camera.microlens_distance_mm
     bend, radius = camera.bend, camera.aperture_radius_mm
-    centre, width = scene.centres_mm[voxel], scene.width_mm
-    rectangle, upper, lens, scratch = work[0], work[1], work[2], work[3]
-    begin, end = scene.cell_pixel.size, 0
     side = 2.0 * radius / scene.strips
-    for task in range(scene.node_share.size * scene.strips):
-        node, strip = task // scene.strips, task % scene.strips
-        low, high = strip * side - radius, (strip + 1) * side - radius
-        set_rectangle(rectangle, centre - 0.5 * width, centre + 0.5 * width, low, high)
-        place_low, scale_low = _array_place(scene, plane, node, centre, low)
-        place_high, scale_high = _array_place(scene, plane, node, centre, high)
-        alpha, beta = (place_high - place_low) / side, -0.5 * (scale_low + scale_high)
-        offset = place_low - alpha * low - beta * centre
-        reach = abs(beta) * 0.5 * width
-        first = int(np.floor((min(place_low, place_high) - reach - optics.lens_origin_mm) / optics.lens_pitch_mm + 0.5))
-        last = int(np.floor((max(place_low, place_high) + reach - optics.lens_origin_mm) / optics.lens_pitch_mm + 0.5))
-        a = beta * bend + s_mu * beta / s_i
-        b = alpha * bend + s_mu * (alpha - 1.0) / s_i
-        for n in range(max(first, scene.first_lens), min(last, scene.first_lens + scene.cell_start.size - 2) + 1):
-            at, stop = scene.cell_start[n - scene.first_lens], scene.cell_start[n - scene.first_lens + 1]
-            s = optics.lens_origin_mm + n * optics.lens_pitch_mm
-            corners = cut(rectangle[:4], beta, alpha, s + 0.5 * optics.lens_width_mm - offset, upper)
-            corners = cut(upper[:corners], -beta, -alpha, -(s - 0.5 * optics.lens_width_mm - offset), lens)
-            if corners < 3 or at == stop:
-                continue
-            share = scene.node_share[node] / (2.0 * radius * width)
-            shift = s * (1.0 - bend) + offset * (bend + s_mu / s_i)
-            _add_lens(optics, lens[:corners], (a, b, shift), scene.cell_pixel[at:stop], share, scratch, shares[at:stop])
-            begin, end = min(begin, at), max(end, stop)
-    return begin, end
+    shares = np.zeros(scene.cell_pixel.size)
+    work = np.empty((4, MOST_CORNERS, 2))
+    rectangle, upper, lens, scratch = work[0], work[1], work[2], work[3]
+    for row in range(part[0] * voxels, part[1] * voxels):
+        plane, centre = row // voxels, scene.centres_mm[row % voxels]
+        # The first cell touched and the one behind the last.
+        begin, end = scene.cell_pixel.size, 0
+        for task in range(scene.node_share.size * scene.strips):
+            # In each strip of X the ray's place on the array is linear, x_m = alpha X - scale x + offset, right at both
+            # ends.
+            node, strip = task // scene.strips, task % scene.strips
+            low, high = strip * side - radius, (strip + 1) * side - radius
+            set_rectangle(rectangle, centre - 0.5 * width, centre + 0.5 * width, low, high)
+            place_low, scale_low = _array_place(scene, plane, node, centre, low)
+            place_high, scale_high = _array_place(scene, plane, node, centre, high)
+            alpha, beta = (place_high - place_low) / side, -0.5 * (scale_low + scale_high)
+            offset = place_low - alpha * low - beta * centre
+            reach = abs(beta) * 0.5 * width
+            lowest, highest = min(place_low, place_high) - reach, max(place_low, place_high) + reach
+            first = int(np.floor((lowest - optics.lens_origin_mm) / optics.lens_pitch_mm + 0.5))
+            last = int(np.floor((highest - optics.lens_origin_mm) / optics.lens_pitch_mm + 0.5))
+            a = beta * bend + s_mu * beta / s_i
+            b = alpha * bend + s_mu * (alpha - 1.0) / s_i
+            for n in range(max(first, scene.first_lens), min(last, scene.first_lens + scene.cell_start.size - 2) + 1):
+                at, stop = scene.cell_start[n - scene.first_lens], scene.cell_start[n - scene.first_lens + 1]
+                s = optics.lens_origin_mm + n * optics.lens_pitch_mm
+                corners = cut(rectangle[:4], beta, alpha, s + 0.5 * optics.lens_width_mm - offset, upper)
+                corners = cut(upper[:corners], -beta, -alpha, -(s - 0.5 * optics.lens_width_mm - offset), lens)
+                if corners < 3 or at == stop:
+                    continue
+                share = scene.node_share[node] / (2.0 * radius * width)
+                shift = s * (1.0 - bend) + offset * (bend + s_mu / s_i)
+                pixels = scene.cell_pixel[at:stop]
+                _add_lens(optics, lens[:corners], (a, b, shift), pixels, share, scratch, shares[at:stop])
+                begin, end = min(begin, at), max(end, stop)
+        found = 0
+        for at in range(begin, end):
+            if shares[at] > SMALLEST_SHARE:
+                if start_of_row.size:
+                    cell[start_of_row[row] + found] = at
+                    share_of_cell[start_of_row[row] + found] = shares[at]
+                found += 1
+            shares[at] = 0.0
+        counts[row] = found
 
 
 @njit(cache=True)

@@ -23,8 +23,7 @@ from lfpiv_cli.weights.axis import Bending, FittedBending, axis_weights, depth_n
 from lfpiv_cli.weights.lens_cells import AxisOptics, aperture_mask
 from lfpiv_cli.weights.operators import BrickOperator, FactorisedOperator
 from lfpiv_cli.weights.scene import Source
-from lfpiv_cli.weights.strip_blocks import StripLayout, factorise_strips, strip_layout
-from lfpiv_cli.weights.strips import StripOperator
+from lfpiv_cli.weights.strip_blocks import StripLayout, strip_layout
 
 # A lattice counts as aligned with the sensor when over its whole width it strays by less than a hundredth of a pixel.
 ALIGNED_PX = 0.01
@@ -96,29 +95,22 @@ def _factorised(
     if isinstance(source, PolynomialRays):
         bent = [fitted_bending(source, camera, grid, axis) for axis in (0, 1)]
     else:
-        bent = traced_bending(source, camera, grid, (x, y))
+        depths = depth_nodes(grid.axis_mm(2), grid.spacing_mm[2])
+        if equivalent_object_distance(depths.min(), camera.focus_distance_mm, source.media) <= 0.0:
+            raise ConfigError(
+                f"volume: its nearest point lies {written(grid.bounds_mm(2)[0], 4)} mm from the focal point, behind "
+                "the main lens"
+            )
+        reach = camera.aperture_radius_mm + float(np.hypot(*(np.abs(grid.bounds_mm(axis)).max() for axis in (0, 1))))
+        nodes, factors = (
+            table.reshape(*depths.shape, -1) for table in source.slope_polynomials(camera, depths.ravel(), reach)
+        )
+        beside = [float(np.mean(grid.axis_mm(other) ** 2)) for other in (y, x)]
+        bent = [Bending(nodes, factors, each, 1 if source.straight else STRIPS) for each in beside]
     along_columns = axis_weights(columns, grid.axis_mm(x), grid.spacing_mm[x], bent[0])
     along_rows = axis_weights(rows, grid.axis_mm(y), grid.spacing_mm[y], bent[1])
     mask = aperture_mask(along_columns.cells, along_rows.cells, camera.aperture_radius_mm)
     return FactorisedOperator(along_columns, along_rows, mask)
-
-
-def traced_bending(space: ObjectSpace, camera: Camera, grid: Grid, axes: tuple[int, int]) -> list[Bending]:
-    """Return how rays are bent along the columns and along the rows, which follow world `axes`."""
-    depths = depth_nodes(grid.axis_mm(2), grid.spacing_mm[2])
-    if equivalent_object_distance(depths.min(), camera.focus_distance_mm, space.media) <= 0.0:
-        raise ConfigError(
-            f"volume: its nearest point lies {written(grid.bounds_mm(2)[0], 4)} mm from the focal point, behind the "
-            "main lens"
-        )
-    reach = camera.aperture_radius_mm + float(np.hypot(*(np.abs(grid.bounds_mm(axis)).max() for axis in (0, 1))))
-    nodes, factors = (
-        table.reshape(*depths.shape, -1) for table in space.slope_polynomials(camera, depths.ravel(), reach)
-    )
-    strips = 1 if space.straight else STRIPS
-
-    beside = [float(np.mean(grid.axis_mm(other) ** 2)) for other in axes[::-1]]
-    return [Bending(nodes, factors, each, strips) for each in beside]
 
 
 def fitted_bending(rays: PolynomialRays, camera: Camera, grid: Grid, axis: int) -> FittedBending:
@@ -148,52 +140,35 @@ def fitted_bending(rays: PolynomialRays, camera: Camera, grid: Grid, axis: int) 
     return FittedBending(table, rays.scale_mm[list(own)], STRIPS)
 
 
-def coupling_mm(rays: PolynomialRays, camera: Camera, grid: Grid) -> float:
-    """Return how far on the array, rms over voxels and aperture, fitted rays are from those that separate."""
-    rng = np.random.default_rng(0)
-    bounds = np.array([grid.bounds_mm(axis) for axis in range(3)])
-    planes = rng.integers(0, grid.shape_xyz[2], COUPLING_RAYS)
-    points = rng.uniform(bounds[:, 0], bounds[:, 1], (COUPLING_RAYS, 3))
-    points[:, 2] = depth_nodes(grid.axis_mm(2), grid.spacing_mm[2])[planes, 0]
-    points = camera.to_image_axes(points)
-    crossings = disc_points(COUPLING_RAYS, camera.aperture_radius_mm, rng)
-    off = rays.on_array(points, crossings)
-    for axis in (0, 1):
-        bent = fitted_bending(rays, camera, grid, axis)
-        x, crossing = points[:, axis] / bent.scale_mm[0], crossings[:, axis] / bent.scale_mm[1]
-        powers = np.arange(rays.degree + 1)
-        terms = x[:, np.newaxis, np.newaxis] ** powers[:, np.newaxis] * crossing[:, np.newaxis, np.newaxis] ** powers
-        off[:, axis] -= np.sum(terms * bent.coefficients_mm[planes, 0], axis=(1, 2))
-    return float(np.sqrt(np.mean(off**2)))
-
-
 def separates(camera: Camera, source: Source, grid: Grid) -> bool:
     """Return whether array and rays separate into two axes, so that weights factorise."""
     if not aligned(camera):
         return False
     if isinstance(source, PolynomialRays):
-        return coupling_mm(source, camera, grid) < LARGEST_COUPLING * float(camera.lattice.pitch.min())
+        # How far on the array, rms over voxels and aperture, fitted rays are from those that separate.
+        rng = np.random.default_rng(0)
+        bounds = np.array([grid.bounds_mm(axis) for axis in range(3)])
+        planes = rng.integers(0, grid.shape_xyz[2], COUPLING_RAYS)
+        points = rng.uniform(bounds[:, 0], bounds[:, 1], (COUPLING_RAYS, 3))
+        points[:, 2] = depth_nodes(grid.axis_mm(2), grid.spacing_mm[2])[planes, 0]
+        points = camera.to_image_axes(points)
+        crossings = disc_points(COUPLING_RAYS, camera.aperture_radius_mm, rng)
+        off = source.on_array(points, crossings)
+        for axis in (0, 1):
+            bent = fitted_bending(source, camera, grid, axis)
+            x, crossing = points[:, axis] / bent.scale_mm[0], crossings[:, axis] / bent.scale_mm[1]
+            powers = np.arange(source.degree + 1)
+            terms = (
+                x[:, np.newaxis, np.newaxis] ** powers[:, np.newaxis] * crossing[:, np.newaxis, np.newaxis] ** powers
+            )
+            off[:, axis] -= np.sum(terms * bent.coefficients_mm[planes, 0], axis=(1, 2))
+        return float(np.sqrt(np.mean(off**2))) < LARGEST_COUPLING * float(camera.lattice.pitch.min())
     return not isinstance(source, CurvedSpace) or strips_of(camera, source, grid) is not None
 
 
 def strips_of(camera: Camera, space: CurvedSpace, grid: Grid) -> StripLayout | None:
     """Return the strips of a volume within which array and rays separate into two axes; None where they do in none."""
     return strip_layout(camera, space, grid, axis_optics(camera)) if aligned(camera) else None
-
-
-def weights_in_axes(camera: Camera, source: Source, grid: Grid) -> FactorisedOperator | StripOperator | None:
-    """Return the weights of a grid in factorised form, whole or in strips; None where array or rays do not separate.
-
-    Raises
-    ------
-    ConfigError : a voxel lies where it cannot be
-    """
-    if isinstance(source, CurvedSpace) and aligned(camera):
-        layout = strips_of(camera, source, grid)
-        return factorise_strips(camera, source, grid, axis_optics(camera), layout.turned) if layout else None
-    if isinstance(source, CurvedSpace) or not separates(camera, source, grid):
-        return None
-    return factorise_through(camera, source, grid)
 
 
 def aligned(camera: Camera) -> bool:

@@ -24,10 +24,11 @@ from lfpiv_cli.optics.curved_space import CurvedSpace
 from lfpiv_cli.optics.tracing import struck_pixel
 from lfpiv_cli.robust import BRIGHTEST_PERCENTILE, LIT_SHARE
 from lfpiv_cli.threads import share_out
-from lfpiv_cli.weights.build import weights_in_axes
+from lfpiv_cli.weights.build import axis_optics, factorise_through, separates, strips_of
 from lfpiv_cli.weights.operators import Column, FactorisedOperator, real_array, voxel_index
 from lfpiv_cli.weights.quadrature import DEPTH_NODES, TILES, Columns, integrate_columns
 from lfpiv_cli.weights.scene import Scene, Source, kernel_scene, lit_voxels, on_array, on_sensor, rays_from
+from lfpiv_cli.weights.strip_blocks import factorise_strips, voxel_centres
 from lfpiv_cli.weights.strips import StripOperator
 
 # Columns may take this much memory: two thirds of a machine with 24 GiB, the rest is for volumes and images.
@@ -203,10 +204,7 @@ class OnDemandOperator:
 
     def centres_mm(self, voxel: NDArray[np.int64]) -> NDArray[np.float64]:
         """Return the centres (n, 3) of voxels, image axes."""
-        plane, row, column = np.unravel_index(voxel, self.shape)
-        first, second = (0, 1) if self.camera.column_axis == "x" else (1, 0)
-        axes = (self.grid.axis_mm(first)[column], self.grid.axis_mm(second)[row], self.grid.axis_mm(2)[plane])
-        return np.stack(axes, axis=1)
+        return voxel_centres(self.camera, self.grid, np.stack(np.unravel_index(voxel, self.shape), axis=1))
 
 
 def operator_of(camera: Camera, source: Source, grid: Grid) -> FactorisedOperator | StripOperator | OnDemandOperator:
@@ -218,7 +216,12 @@ def operator_of(camera: Camera, source: Source, grid: Grid) -> FactorisedOperato
     ------
     ConfigError : a voxel lies where it cannot be
     """
-    return weights_in_axes(camera, source, grid) or OnDemandOperator(camera, source, grid)
+    if isinstance(source, CurvedSpace):
+        if layout := strips_of(camera, source, grid):
+            return factorise_strips(camera, source, grid, axis_optics(camera), layout.turned)
+    elif separates(camera, source, grid):
+        return factorise_through(camera, source, grid)
+    return OnDemandOperator(camera, source, grid)
 
 
 def seen_share(camera: Camera, source: Source, grid: Grid) -> tuple[float, float]:
@@ -308,28 +311,20 @@ def _seen_shares(part: tuple[int, int], scene: Scene, lit: NDArray[np.bool_], se
 
     Those of voxels `part`; `lit` is flat.
     """
+    camera, middle = scene.camera, scene.depth_share.size // 2
     for n in range(part[0], part[1]):
-        seen[n] = _lit_share(scene, scene.centres_mm[n], scene.plane[n], lit)
-
-
-@njit(cache=True)
-def _lit_share(scene: Scene, point: NDArray[np.float64], plane: int, lit: NDArray[np.bool_]) -> float:
-    """Return the share of the lines of sight from a point, among those that meet the sensor, that end on lit pixels."""
-    camera, total, found = scene.camera, 0.0, 0.0
-    middle = scene.depth_share.size // 2
-    rays = rays_from(scene, point, plane, middle)
-    if rays.shape[1] == 0:
-        return 0.0
-    for t in range(scene.tile_share.size):
-        crossing = scene.tile_mm[t]
-        x, y = on_array(scene, point, rays, crossing[0], crossing[1])
-        distorted = 1.0 + camera.distortion_per_mm2 * (x * x + y * y)
-        m_x, m_y = x * distorted, y * distorted
-        centre_x, centre_y = nearest_point(m_x, m_y, camera.origin_mm, camera.basis_mm)
-        x = on_sensor(camera, x, crossing[0], m_x, centre_x)
-        y = on_sensor(camera, y, crossing[1], m_y, centre_y)
-        pixel = struck_pixel(camera, x, y)
-        if pixel >= 0:
-            total += scene.tile_share[t]
-            found += scene.tile_share[t] * lit[pixel]
-    return found / total if total > 0.0 else 0.0
+        point, total, found = scene.centres_mm[n], 0.0, 0.0
+        rays = rays_from(scene, point, scene.plane[n], middle)
+        for t in range(scene.tile_share.size if rays.shape[1] > 0 else 0):
+            crossing = scene.tile_mm[t]
+            x, y = on_array(scene, point, rays, crossing[0], crossing[1])
+            distorted = 1.0 + camera.distortion_per_mm2 * (x * x + y * y)
+            m_x, m_y = x * distorted, y * distorted
+            centre_x, centre_y = nearest_point(m_x, m_y, camera.origin_mm, camera.basis_mm)
+            x = on_sensor(camera, x, crossing[0], m_x, centre_x)
+            y = on_sensor(camera, y, crossing[1], m_y, centre_y)
+            pixel = struck_pixel(camera, x, y)
+            if pixel >= 0:
+                total += scene.tile_share[t]
+                found += scene.tile_share[t] * lit[pixel]
+        seen[n] = found / total if total > 0.0 else 0.0

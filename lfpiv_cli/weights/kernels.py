@@ -1,15 +1,17 @@
-"""The compiled loops of the factorised operators; `operators` holds their readable twins.
+"""The compiled loops of separated weights; `operators` and `strips` hold their readable twins.
 
-Every step is one form, some lines as sums of many (`simd.combine`). The lit column cells are cut into tiles, and a tile
-goes through both steps, along the columns and along the rows, some planes at a time, while these are in the cache.
-Registers hold neighbouring cells of the columns in the sums over the rows, and neighbouring voxels of the rows in the
-sums over the columns: so neither has terms that are zero; what is between them is turned.
-Each output element is one sum in a fixed order, so the result does not depend on the number of threads, nor on how many
-numbers a register holds.
+Every step is one form, some lines as sums of many (`simd`). The volume is cut into blocks, some neighbouring lines of
+voxels in some planes, with two factors each: all lines where the weights factorise as a whole, `STRIP` lines behind
+curved faces. The lit column cells are cut into tiles. Where a tile and a block meet is a visit, and it goes through
+both steps, along the columns and along the rows, while it is in the cache. Registers hold neighbouring cells of the
+columns in the sums over the rows, and neighbouring voxels of the rows in the sums over the columns: so neither has
+terms that are zero; what is between them is turned. Each output element is one sum in a fixed order, so the result does
+not depend on the number of threads, nor on how many numbers a register holds.
 
-Arrays: float32. `height` and `width` count the voxels along the sensor's rows and columns, the height filled up to a
-multiple of `LANES`; `by_cell` is (tiles, row lines, TILE). The steps along one axis have their tables: `Terms` along
-the rows, `CellBlocks` and `VoxelSums` along the columns.
+Along the lines weights may change with a line's place in its strip: such have `COEFFICIENTS`, others one number.
+
+Arrays: float32. Volumes are turned (planes, voxels along the columns, lines), the lines filled up to a multiple of
+`LANES`; `by_cell` is (tiles, row lines, TILE).
 """
 
 from __future__ import annotations
@@ -20,27 +22,51 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from lfpiv_cli.simd.combine import (
+from lfpiv_cli.simd import (
+    COEFFICIENTS,
     GROUP,
+    LANES,
     TILE,
     VECTORS,
     combine_line,
     combine_long,
     combine_turned,
+    combine_turned_varying,
+    combine_varying,
     combine_vector,
     turn,
 )
-from lfpiv_cli.simd.vectors import LANES
-from lfpiv_cli.threads import in_threads, share_out
+from lfpiv_cli.threads import share_out
 
 Floats = NDArray[np.float32]
 Index = NDArray[np.int64]
 
-# Planes that go through both steps together, one number forward and one back: what they hold of a tile stays in the
-# second-level cache, what the neighbouring sums share of it in the first, and yet the sums over them are long.
-PLANES_FORWARD, PLANES_BACK = 8, 16
+# Lines of a strip: those that a register holds, or two hold. And planes: what a block has of a tile stays in the cache.
+STRIP, SLAB = 16, 8
+# Where each line lies in its strip, from -1 to 1.
+PLACES = np.linspace(-1.0, 1.0, STRIP).astype(np.float32)
 # Numbers in a line of the cache.
 CACHE_LINE = 16
+
+
+class Blocks(NamedTuple):
+    """Where each block lies.
+
+    Attributes
+    ----------
+    plane, planes, line : (blocks,) int64, its first plane, how many it has, and its first line
+    """
+
+    plane: Index
+    planes: Index
+    line: Index
+
+
+class BlockShape(NamedTuple):
+    """How many planes a block has at most, a multiple of `GROUP`, and how many lines, a multiple of `LANES`."""
+
+    planes: int
+    lines: int
 
 
 class Terms(NamedTuple):
@@ -53,24 +79,64 @@ class Terms(NamedTuple):
     share : (terms, sums that share it) float32, its share in each
     """
 
-    start: NDArray[np.int64]
+    start: Index
     line: NDArray[np.int32]
-    share: NDArray[np.float32]
+    share: Floats
 
 
-class CellBlocks(NamedTuple):
-    """The weights along the columns for `LANES` cells at once: as many neighbouring voxels for each.
+class VisitsForward(NamedTuple):
+    """The weights along the lines for `LANES` column cells at once.
 
     Attributes
     ----------
-    start : (blocks + 1,) int64, the first row of each block
-    voxel : (blocks * LANES,) int32, the first voxel of each cell
-    share : (rows, LANES) float32, row by row that of the next voxel
+    of_tile : (tiles + 1,) int64, the first visit of each tile
+    block : (visits,) int64
+    start : (visits * planes of a block * VECTORS + 1,) int64, the first row of each plane and vector
+    voxel : (visits * planes of a block * TILE,) int32, the first voxel of each cell
+    share : (rows, coefficients, LANES) float32, row by row those of the next voxel
     """
 
-    start: NDArray[np.int64]
+    of_tile: Index
+    block: Index
+    start: Index
     voxel: NDArray[np.int32]
-    share: NDArray[np.float32]
+    share: Floats
+
+
+class RowSums(NamedTuple):
+    """The weights across the lines, for `GROUP` row cells at once.
+
+    Attributes
+    ----------
+    of_block : (blocks + 1,) int64, the first sum of each block
+    group : (sums,) int64, the group of row cells
+    terms : of each sum; line p * lines of a block + k is line k in the block's plane p
+    """
+
+    of_block: Index
+    group: Index
+    terms: Terms
+
+
+class VisitsBack(NamedTuple):
+    """The weights along the lines for the voxels that a tile lights.
+
+    Attributes
+    ----------
+    of_tile : (tiles * slabs + 1,) int64, the first visit of each tile and slab, as many planes as a block may have
+    block : (visits,) int64
+    owned : (visits * planes of a block + 1,) int64, the first sum of each plane of each visit
+    voxel : (visits * planes of a block,) int32, the voxel of this sum; the others follow one by one
+    start, line, share : the first term of each sum, and cell and coefficients (terms, coefficients) of each
+    """
+
+    of_tile: Index
+    block: Index
+    owned: Index
+    voxel: NDArray[np.int32]
+    start: Index
+    line: NDArray[np.int32]
+    share: Floats
 
 
 class LitRows(NamedTuple):
@@ -86,23 +152,6 @@ class LitRows(NamedTuple):
     start: Index
     cell: Index
     line: Index
-
-
-class VoxelSums(NamedTuple):
-    """The weights along the columns for the voxels that a tile of cells lights in a plane, its lines being cells.
-
-    Attributes
-    ----------
-    owned : (tiles * planes + 1,) int64, the first sum of each tile and plane
-    voxel : (tiles * planes,) int32, the voxel of this sum; the others follow one by one
-    start, line, share : of `Terms`, one share a term
-    """
-
-    owned: NDArray[np.int64]
-    voxel: NDArray[np.int32]
-    start: NDArray[np.int64]
-    line: NDArray[np.int32]
-    share: NDArray[np.float32]
 
 
 @njit(cache=True)
@@ -130,173 +179,148 @@ def _turn_planes(part: tuple[int, int], volume: Floats, found: Floats) -> None:
                 found[plane, column, row] = volume[plane, row, column]
 
 
-def project(volume: Floats, columns: CellBlocks, rows: Terms, tiles: int) -> Floats:
-    """Return sum_z B_z V_z A_z^T by cells of a volume (planes, width, filled height).
-
-    Block (tile * planes + plane) * VECTORS + v of `columns` has the cells of vector v. Sum g of each `PLANES_FORWARD`
-    planes in `rows` gives lines g * GROUP on of `by_cell`; its terms are lines plane * height + voxel, planes counted
-    from the first of these.
-    """
-    sums = (rows.start.size - 1) // -(-volume.shape[0] // PLANES_FORWARD)
-    flat_cell = room_for(tiles * GROUP * sums * TILE)
-    share_out(_project_tiles, tiles, volume, columns, rows, flat_cell)
-    return flat_cell.reshape(tiles, GROUP * sums, TILE)
-
-
 @njit(cache=True, nogil=True)
-def _project_tiles(part: tuple[int, int], volume: Floats, columns: CellBlocks, rows: Terms, flat_cell: Floats) -> None:
-    """Write a part of the tiles of `project`."""
-    planes, width, height = volume.shape
-    chunks = -(-planes // PLANES_FORWARD)
-    sums = (rows.start.size - 1) // chunks
-    flat_volume = volume.reshape(-1)
-    block_start, block_voxel, block_share = columns.start, columns.voxel, columns.share.reshape(-1)
-    start, line, share = rows.start, rows.line, rows.share.reshape(-1)
-    lines = room_for(PLANES_FORWARD * height * TILE)
-    for tile in range(part[0], part[1]):
-        lit_chunks = 0
-        for chunk in range(chunks):
-            first = chunk * PLANES_FORWARD
-            last = min(first + PLANES_FORWARD, planes)
-            if block_start[(tile * planes + first) * VECTORS] == block_start[(tile * planes + last) * VECTORS]:
-                continue
-            for plane in range(first, last):
-                for v in range(VECTORS):
-                    block = (tile * planes + plane) * VECTORS + v
-                    count = block_start[block + 1] - block_start[block]
-                    for y in range(0, height, LANES):
-                        to = (((plane - first) * height + y) * TILE + v * LANES, TILE)
-                        terms = (plane * width * height + y, height, block * LANES, count)
-                        shares = block_start[block] * LANES
-                        combine_turned(lines, to, flat_volume, block_voxel, terms, block_share, shares)
-            for g in range(sums):
-                at = chunk * sums + g
-                if lit_chunks > 0 and start[at] == start[at + 1]:
-                    continue
-                to = (tile * sums + g) * GROUP * TILE
-                terms = (0, TILE, start[at], start[at + 1] - start[at])
-                combine_long(
-                    flat_cell, (to, TILE, lit_chunks), lines, line, terms, share, (start[at] * GROUP, GROUP, 1)
-                )
-            lit_chunks += 1
-        if lit_chunks == 0:
-            flat_cell[tile * sums * GROUP * TILE : (tile + 1) * sums * GROUP * TILE] = 0.0
-
-
-def back_project(by_cell: Floats, shape: tuple[int, int, int], rows: Terms, columns: VoxelSums, threads: int) -> Floats:
-    """Return B_z^T I A_z as a volume of `shape` (planes, width, filled height).
-
-    Each `PLANES_BACK` planes have for each voxel PLANES_BACK / GROUP sums in `rows`, whose terms are lines of
-    `by_cell`. Tile * planes + plane owns sums in `columns`.
-    """
-    volume = np.zeros(shape, np.float32)
-    chunks = -(-shape[0] // PLANES_BACK)
-    # A thread takes a tile through all of its planes, so that the cells come into its cache once.
-    in_threads(
-        lambda part: _back_project_planes(part, by_cell, volume, rows, columns),
-        [(thread * chunks // threads, (thread + 1) * chunks // threads) for thread in range(threads)],
-    )
-    return volume
-
-
-@njit(cache=True, nogil=True)
-def _back_project_planes(
-    part: tuple[int, int], by_cell: Floats, volume: Floats, rows: Terms, columns: VoxelSums
+def project_tiles(
+    part: tuple[int, int],
+    volume: Floats,
+    blocks: Blocks,
+    shape: BlockShape,
+    columns: VisitsForward,
+    rows: RowSums,
+    groups: int,
+    places: Floats,
+    flat_cell: Floats,
 ) -> None:
-    """Write a part of the volume of `back_project`, counted in `PLANES_BACK` planes."""
-    planes, width, height = volume.shape
-    tiles, size = by_cell.shape[0], by_cell.shape[1] * TILE
-    flat_cell, flat_volume = by_cell.reshape(-1), volume.reshape(-1)
-    start, line, share = rows.start, rows.line, rows.share.reshape(-1)
-    pairs = PLANES_BACK // GROUP
-    lines, cells = room_for(PLANES_BACK * height * TILE), room_for(TILE * height)
-    for tile in range(tiles):
-        for chunk in range(part[0], part[1]):
-            first = chunk * PLANES_BACK
-            last = min(first + PLANES_BACK, planes)
-            if columns.owned[tile * planes + first] == columns.owned[tile * planes + last]:
-                continue
-            # One voxel through all planes: these see the same cells, which stay in the fastest cache.
-            for voxel in range(height):
-                for pair in range(pairs):
-                    at = (chunk * height + voxel) * pairs + pair
-                    to = ((pair * GROUP * height + voxel) * TILE, height * TILE, 0)
-                    terms = (tile * size, TILE, start[at], start[at + 1] - start[at])
-                    combine_long(lines, to, flat_cell, line, terms, share, (start[at] * GROUP, GROUP, 1))
-            for plane in range(first, last):
-                for y in range(0, height, LANES):
-                    for v in range(0, TILE, LANES):
-                        source = (((plane - first) * height + y) * TILE + v, TILE)
-                        turn(cells, (v * height + y, height), lines, source)
-                owner = tile * planes + plane
-                to_voxel = (plane * width + columns.voxel[owner]) * height
-                _add_voxels(flat_volume, to_voxel, cells, height, columns, owner)
-
-
-@njit(cache=True)
-def _add_voxels(volume: Floats, at: int, cells: Floats, height: int, columns: VoxelSums, owner: int) -> None:
-    """Add to lines of `height` voxels, from place `at` in the flat volume on, the sums over cells that `owner` has."""
-    start, line, share = columns.start, columns.line, columns.share.reshape(-1)
-    whole = height // TILE * TILE
-    for n in range(columns.owned[owner], columns.owned[owner + 1]):
-        first, count = start[n], start[n + 1] - start[n]
-        for y in range(0, whole, TILE):
-            combine_line(volume, (at + y, 0, 1), cells, line, (y, height, first, count), share, (first, 1, 0))
-        for y in range(whole, height, LANES):
-            combine_vector(volume, (at + y, 0, 1), cells, line, (y, height, first, count), share, (first, 1, 0))
-        at += height
-
-
-def fold(by_cell: Floats, mask: Floats, runs: Index, rows: LitRows, shape: tuple[int, int]) -> Floats:
-    """Return the image (rows, columns) of `shape`: C times the light of each lit cell, added up by pixel.
-
-    `runs` (runs, 4) are neighbouring column cells of a tile, and of a lens: the first one's number among all cells and
-    among the lit, its pixel, and how many they are.
-    """
-    image = np.empty(shape, np.float32)
-    share_out(_fold_rows, shape[0], by_cell, mask, runs, rows, image)
-    return image
+    """Write a part of the tiles of a turned volume's light by cells, flat (tiles, groups * GROUP, TILE)."""
+    width, height = volume.shape[1:]
+    coefficients = columns.share.shape[1]
+    flat_volume, share = volume.reshape(-1), columns.share.reshape(-1)
+    row_start, row_line, row_share = rows.terms.start, rows.terms.line, rows.terms.share.reshape(-1)
+    start, voxel = columns.start, columns.voxel
+    lines = room_for(shape.planes * shape.lines * TILE)
+    for tile in range(part[0], part[1]):
+        flat_cell[tile * groups * GROUP * TILE : (tile + 1) * groups * GROUP * TILE] = 0.0
+        for visit in range(columns.of_tile[tile], columns.of_tile[tile + 1]):
+            block = columns.block[visit]
+            for p in range(blocks.planes[block]):
+                source = (blocks.plane[block] + p) * width * height + blocks.line[block]
+                for v in range(VECTORS):
+                    at = (visit * shape.planes + p) * VECTORS + v
+                    shares = start[at] * coefficients * LANES
+                    for y in range(0, shape.lines, LANES):
+                        to = ((p * shape.lines + y) * TILE + v * LANES, TILE)
+                        terms = (source + y, height, at * LANES, start[at + 1] - start[at])
+                        if coefficients == COEFFICIENTS:
+                            combine_turned_varying(lines, to, flat_volume, voxel, terms, share, shares, places, y)
+                        else:
+                            combine_turned(lines, to, flat_volume, voxel, terms, share, shares)
+            for n in range(rows.of_block[block], rows.of_block[block + 1]):
+                to_cell = ((tile * groups + rows.group[n]) * GROUP * TILE, TILE, 1)
+                row_terms = (0, TILE, row_start[n], row_start[n + 1] - row_start[n])
+                combine_long(
+                    flat_cell, to_cell, lines, row_line, row_terms, row_share, (row_start[n] * GROUP, GROUP, 1)
+                )
 
 
 @njit(cache=True, nogil=True)
-def _fold_rows(part: tuple[int, int], by_cell: Floats, mask: Floats, runs: Index, rows: LitRows, image: Floats) -> None:
-    """Write a part of the image rows of `fold`."""
+def back_project_slabs(
+    part: tuple[int, int],
+    by_cell: Floats,
+    volume: Floats,
+    blocks: Blocks,
+    shape: BlockShape,
+    rows: Terms,
+    columns: VisitsBack,
+    places: Floats,
+) -> None:
+    """Add what light by cells (tiles, row cells, TILE) is spread back to, in a part of a turned volume.
+
+    The part counts slabs of planes. Each block has for each of its lines planes / GROUP sums in `rows`, whose terms are
+    lines of `by_cell`.
+    """
+    width, height = volume.shape[1:]
+    tiles, size = by_cell.shape[0], by_cell.shape[1] * TILE
+    slabs = (columns.of_tile.size - 1) // max(tiles, 1)
+    coefficients = columns.share.shape[1]
+    flat_cell, flat_volume = by_cell.reshape(-1), volume.reshape(-1)
+    row_start, row_line, row_share = rows.start, rows.line, rows.share.reshape(-1)
+    start, line, share = columns.start, columns.line, columns.share.reshape(-1)
+    pairs, whole = shape.planes // GROUP, shape.lines // TILE * TILE
+    lines, cells = room_for(shape.planes * shape.lines * TILE), room_for(TILE * shape.lines)
+    for tile in range(tiles):
+        for visit in range(columns.of_tile[tile * slabs + part[0]], columns.of_tile[tile * slabs + part[1]]):
+            block = columns.block[visit]
+            # One line through all planes: these see the same cells, which stay in the fastest cache.
+            for k in range(shape.lines):
+                for pair in range(pairs):
+                    at = (block * shape.lines + k) * pairs + pair
+                    to = ((pair * GROUP * shape.lines + k) * TILE, shape.lines * TILE, 0)
+                    terms = (tile * size, TILE, row_start[at], row_start[at + 1] - row_start[at])
+                    combine_long(lines, to, flat_cell, row_line, terms, row_share, (row_start[at] * GROUP, GROUP, 1))
+            for p in range(blocks.planes[block]):
+                for y in range(0, shape.lines, LANES):
+                    for v in range(0, TILE, LANES):
+                        turn(cells, (v * shape.lines + y, shape.lines), lines, ((p * shape.lines + y) * TILE + v, TILE))
+                owner = visit * shape.planes + p
+                to_voxel = ((blocks.plane[block] + p) * width + columns.voxel[owner]) * height + blocks.line[block]
+                for n in range(columns.owned[owner], columns.owned[owner + 1]):
+                    first, count = start[n], start[n + 1] - start[n]
+                    if coefficients == COEFFICIENTS:
+                        for y in range(0, shape.lines, LANES):
+                            sums = (y, shape.lines, first, count)
+                            shares = first * COEFFICIENTS
+                            combine_varying(flat_volume, to_voxel + y, cells, line, sums, share, shares, places, y)
+                    else:
+                        for y in range(0, whole, TILE):
+                            sums = (y, shape.lines, first, count)
+                            combine_line(flat_volume, (to_voxel + y, 0, 1), cells, line, sums, share, (first, 1, 0))
+                        for y in range(whole, shape.lines, LANES):
+                            sums = (y, shape.lines, first, count)
+                            combine_vector(flat_volume, (to_voxel + y, 0, 1), cells, line, sums, share, (first, 1, 0))
+                    to_voxel += height
+
+
+@njit(cache=True, nogil=True)
+def fold_rows(part: tuple[int, int], by_cell: Floats, mask: Floats, runs: Index, rows: LitRows, image: Floats) -> None:
+    """Write a part of the rows of the image: C times the light of each lit cell, added up by pixel.
+
+    `runs` (runs, 5) are neighbouring column cells of a tile, and of a lens: the first one's number among all cells and
+    its place among the lit, its pixel, how many they are, and whether the others follow (1) or come before (-1).
+    """
     for row in range(part[0], part[1]):
         target = image[row]
         target[:] = 0.0
         for at in range(rows.start[row], rows.start[row + 1]):
             weight, line = mask[rows.cell[at]], rows.line[at]
             for run in range(runs.shape[0]):
-                cell, lit, pixel, count = runs[run]
+                cell, lit, pixel, count, step = runs[run]
                 source, k = by_cell[lit // TILE, line], lit % TILE
-                for n in range(count):
-                    target[pixel + n] += weight[cell + n] * source[k + n]
-
-
-def unfold(image: Floats, mask: Floats, runs: Index, rows: tuple[int, int], row_pixel: NDArray[np.int32]) -> Floats:
-    """Return C times the pixel that each lit cell belongs to, (tiles, lit row cells, TILE); `runs` as in `fold`."""
-    tiles, lines = -(-int(runs[:, 3].sum()) // TILE), rows[1] - rows[0]
-    by_cell = room_for(tiles * lines * TILE).reshape(tiles, lines, TILE)
-    share_out(_unfold_lines, lines, image, mask, runs, row_pixel[rows[0] : rows[1]], rows[0], by_cell)
-    return by_cell
+                if step > 0:
+                    for n in range(count):
+                        target[pixel + n] += weight[cell + n] * source[k + n]
+                else:
+                    for n in range(count):
+                        target[pixel + n] += weight[cell + n] * source[k - n]
 
 
 @njit(cache=True, nogil=True)
-def _unfold_lines(
+def unfold_lines(
     part: tuple[int, int],
     image: Floats,
     mask: Floats,
-    runs: Index,
+    pixel: NDArray[np.int32],
     row_pixel: NDArray[np.int32],
     first: int,
     by_cell: Floats,
 ) -> None:
-    """Write a part of the lit row cells of `unfold`, the first of which is row cell `first`."""
+    """Write C times the pixel that each lit cell belongs to, a part of the lit row cells of (tiles, row cells, TILE).
+
+    `mask` (row cells, cells) and `pixel` are those of the lit column cells in their order; the first lit row cell is
+    row cell `first`, and `row_pixel` has the pixels of the lit ones.
+    """
     for line in range(part[0], part[1]):
         source, weight = image[row_pixel[line]], mask[first + line]
-        by_cell[-1:, line] = 0.0
-        for run in range(runs.shape[0]):
-            cell, lit, pixel, count = runs[run]
-            target, k = by_cell[lit // TILE, line], lit % TILE
-            for n in range(count):
-                target[k + n] = weight[cell + n] * source[pixel + n]
+        for begin in range(0, pixel.size, TILE):
+            target = by_cell[begin // TILE, line]
+            for k in range(min(TILE, pixel.size - begin)):
+                target[k] = weight[begin + k] * source[pixel[begin + k]]

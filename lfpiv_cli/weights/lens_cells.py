@@ -80,20 +80,17 @@ def micro_image_cells(optics: AxisOptics) -> Cells:
     start = np.concatenate([[0], np.cumsum(counts)])
     owner = np.repeat(np.arange(lens.size), counts)
     pixel = low[owner] + np.arange(start[-1]) - start[owner]
-    return Cells(int(first), start.astype(np.int64), pixel.astype(np.int32), _patches(optics, lens[owner], pixel))
-
-
-def _patches(optics: AxisOptics, lens_mm: NDArray[np.float64], pixel: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Return the intervals of the main lens that pixels see through lenses' centres, shape (cells, 2)."""
-    camera = optics.camera
-    magnify = camera.image_distance_mm / camera.microlens_distance_mm
+    magnify, radius, centre = (
+        camera.image_distance_mm / camera.microlens_distance_mm,
+        camera.aperture_radius_mm,
+        lens[owner],
+    )
     edges = (pixel[:, np.newaxis] + np.array([1, 0]) - 0.5 * optics.pixels) * camera.pixel_mm
-    patch = lens_mm[:, np.newaxis] - (edges - lens_mm[:, np.newaxis]) * magnify
-    radius = camera.aperture_radius_mm
-    patch = np.clip(patch, -radius, radius)
+    patch = np.clip(centre[:, np.newaxis] - (edges - centre[:, np.newaxis]) * magnify, -radius, radius)
     # A cell that only rays away from the lens's centre reach sees the very edge of the aperture.
     sliver = SMALLEST_PATCH * radius
-    return np.stack([np.minimum(patch[:, 0], radius - sliver), np.maximum(patch[:, 1], sliver - radius)], axis=1)
+    patch = np.stack([np.minimum(patch[:, 0], radius - sliver), np.maximum(patch[:, 1], sliver - radius)], axis=1)
+    return Cells(int(first), start.astype(np.int64), pixel.astype(np.int32), patch)
 
 
 # Convex polygons as corners in order (n, 2), in kernels: cut by half planes, and their areas.
@@ -140,28 +137,6 @@ def polygon_area(polygon: NDArray[np.float64]) -> float:
     return 0.5 * abs(twice)
 
 
-@njit(cache=True)
-def polygon_moments(
-    polygon: NDArray[np.float64], offset_x: float, offset_y: float
-) -> tuple[float, float, float, float, float]:
-    """Return area, centroid (moved by the offset) and widths of a polygon."""
-    twice, sum_x, sum_y = 0.0, 0.0, 0.0
-    x0, y0 = polygon[0, 0], polygon[0, 1]
-    left, right, bottom, top = x0, x0, y0, y0
-    for k in range(1, len(polygon)):
-        x1, y1 = polygon[k, 0], polygon[k, 1]
-        left, right, bottom, top = min(left, x1), max(right, x1), min(bottom, y1), max(top, y1)
-        if k + 1 < len(polygon):
-            x2, y2 = polygon[k + 1, 0], polygon[k + 1, 1]
-            area = (x1 - x0) * (y2 - y0) - (y1 - y0) * (x2 - x0)
-            twice += area
-            sum_x += area * (x0 + x1 + x2) / 3.0
-            sum_y += area * (y0 + y1 + y2) / 3.0
-    if twice <= 0.0:
-        return 0.0, 0.0, 0.0, 0.0, 0.0
-    return 0.5 * twice, sum_x / twice + offset_x, sum_y / twice + offset_y, right - left, top - bottom
-
-
 # A rectangle cut by eight half planes has at most twelve corners.
 MOST_CORNERS = 16
 
@@ -170,12 +145,6 @@ def neighbours(lattice: Lattice) -> NDArray[np.float64]:
     """Return the steps (8, 2) to the surrounding lattice points; half-way to them ends a lens's region."""
     steps = [(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if (i, j) != (0, 0)]
     return np.array(steps, dtype=np.float64) @ lattice.basis
-
-
-def cell_radius(lattice: Lattice) -> float:
-    """Return how far from its lens the lens's region reaches at most: half the basis cell's long diagonal."""
-    first, second = lattice.basis
-    return 0.5 * float(max(np.hypot(*(first + second)), np.hypot(*(first - second))))
 
 
 @njit(cache=True)
@@ -212,7 +181,21 @@ def shared_rectangle(
         now, after = after, now
         if corners < 3:
             return 0.0, 0.0, 0.0, 0.0, 0.0
-    return polygon_moments(now[:corners], centre_x, centre_y)
+    twice, sum_x, sum_y = 0.0, 0.0, 0.0
+    x0, y0 = now[0, 0], now[0, 1]
+    left, right, bottom, top = x0, x0, y0, y0
+    for k in range(1, corners):
+        x1, y1 = now[k, 0], now[k, 1]
+        left, right, bottom, top = min(left, x1), max(right, x1), min(bottom, y1), max(top, y1)
+        if k + 1 < corners:
+            x2, y2 = now[k + 1, 0], now[k + 1, 1]
+            area = (x1 - x0) * (y2 - y0) - (y1 - y0) * (x2 - x0)
+            twice += area
+            sum_x += area * (x0 + x1 + x2) / 3.0
+            sum_y += area * (y0 + y1 + y2) / 3.0
+    if twice <= 0.0:
+        return 0.0, 0.0, 0.0, 0.0, 0.0
+    return 0.5 * twice, sum_x / twice + centre_x, sum_y / twice + centre_y, right - left, top - bottom
 
 
 # The round aperture seen through the pixels.

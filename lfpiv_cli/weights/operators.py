@@ -16,20 +16,32 @@ from __future__ import annotations
 import operator
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import get_num_threads
 from numpy.typing import NDArray
 
 from lfpiv_cli.errors import InputError
-from lfpiv_cli.simd.combine import GROUP, TILE
-from lfpiv_cli.simd.vectors import LANES
-from lfpiv_cli.threads import ensure_own_threads
+from lfpiv_cli.simd import GROUP, LANES, TILE
+from lfpiv_cli.threads import ensure_own_threads, in_threads, share_out
 from lfpiv_cli.weights import kernels
 from lfpiv_cli.weights.axis import AxisWeights
-from lfpiv_cli.weights.kernels import PLANES_BACK, PLANES_FORWARD, CellBlocks, LitRows, Terms, VoxelSums
-from lfpiv_cli.weights.lens_cells import Cells
+from lfpiv_cli.weights.kernels import (
+    PLACES,
+    Blocks,
+    BlockShape,
+    Index,
+    LitRows,
+    RowSums,
+    Terms,
+    VisitsBack,
+    VisitsForward,
+)
+
+# Planes that go through both steps together, one number forward and one back: what they hold of a tile stays in the
+# second-level cache, what the neighbouring sums share of it in the first, and yet the sums over them are long.
+PLANES_FORWARD, PLANES_BACK = 8, 16
 
 # What the weights' verbs are given, checked before compiled loops read it: these know no bounds.
 
@@ -67,6 +79,201 @@ def voxel_index(index: tuple[Any, ...], shape: tuple[int, ...]) -> tuple[int, ..
 Column = tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float32]]
 
 
+class Visits(NamedTuple):
+    """Which tiles and blocks meet, and where each entry of the weights along the columns belongs.
+
+    Attributes
+    ----------
+    of_tile : (tiles * slabs + 1,) int64, the first visit of each
+    block : (visits,) int64
+    of_entry : (entries,) int64, its visit
+    plane, voxel, cell : (entries,) int64; plane in the block, cell in the tile
+    """
+
+    of_tile: Index
+    block: Index
+    of_entry: Index
+    plane: Index
+    voxel: Index
+    cell: Index
+
+
+@dataclass(frozen=True, eq=False)
+class BlockProducts:
+    """The products of separated weights in blocks, and the tables that they take, made when they are first needed.
+
+    Attributes
+    ----------
+    columns, rows : the weights along the columns and the rows, of the planes of one block after the other
+    mask : (row cells, column cells) float32
+    order : of the lit column cells, int32: a block may have those of some tiles only
+    forward_blocks, back_blocks : where the blocks of both products lie, and how large they are; none of the latter
+        crosses a multiple of its planes
+    """
+
+    columns: AxisWeights
+    rows: AxisWeights
+    mask: NDArray[np.float32]
+    order: NDArray[np.int32]
+    forward_blocks: tuple[Blocks, BlockShape]
+    back_blocks: tuple[Blocks, BlockShape]
+
+    def project(self, volume: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return the image (rows, columns) of a turned volume (planes, voxels along the columns, lines)."""
+        columns, (blocks, shape) = self._columns_forward, self.forward_blocks
+        tiles, groups = columns.of_tile.size - 1, self._groups
+        flat_cell = kernels.room_for(tiles * groups * GROUP * TILE)
+        tables = blocks, shape, columns, self._rows_forward, groups, PLACES
+        share_out(kernels.project_tiles, tiles, volume, *tables, flat_cell)
+        by_cell = flat_cell.reshape(tiles, groups * GROUP, TILE)
+        image = np.empty((self.rows.pixels, self.columns.pixels), np.float32)
+        share_out(kernels.fold_rows, len(image), by_cell, self.mask, self._runs, self._lines_of_rows, image)
+        return image
+
+    def back_project(self, image: NDArray[np.float32], shape: tuple[int, int, int]) -> NDArray[np.float32]:
+        """Return the turned volume of a shape that an image is spread back to."""
+        tiles, (first, last) = filled(self.order.size, TILE) // TILE, self._lit_rows
+        pixel, row_pixel = self.columns.cells.pixel[self.order], self.rows.cells.pixel[first:last]
+        by_cell = kernels.room_for(tiles * (last - first) * TILE).reshape(tiles, last - first, TILE)
+        by_cell[-1:] = 0.0
+        share_out(kernels.unfold_lines, last - first, image, self._sorted_mask, pixel, row_pixel, first, by_cell)
+
+        columns, threads, volume = self._columns_back, get_num_threads(), np.zeros(shape, np.float32)
+        slabs = (columns.of_tile.size - 1) // max(tiles, 1)
+        visits = np.diff(columns.of_tile).reshape(tiles, slabs).sum(axis=0)
+        # A thread takes a tile through all of its planes, so that the cells come into its cache once.
+        ends = np.searchsorted(np.cumsum(visits), visits.sum() * np.arange(1, threads) / threads)
+        edges = [0, *ends.tolist(), slabs]
+        tables = *self.back_blocks, self._rows_back, columns, PLACES
+        in_threads(
+            lambda part: kernels.back_project_slabs(part, by_cell, volume, *tables),
+            list(zip(edges, edges[1:], strict=False)),
+        )
+        return volume
+
+    @cached_property
+    def _lit_rows(self) -> tuple[int, int]:
+        """Range of row cells that any voxel reaches."""
+        return lit_range(self.rows.cell)
+
+    @cached_property
+    def _sorted_mask(self) -> NDArray[np.float32]:
+        return np.ascontiguousarray(self.mask[:, self.order])
+
+    @cached_property
+    def _line_of_cell(self) -> Index:
+        """The line of each lit row cell in the sum: no group spans two lenses, whose voxels differ."""
+        first, last = self._lit_rows
+        cell, starts = np.arange(first, last), self.rows.cells.start
+        lens = np.searchsorted(starts, cell, side="right") - 1
+        lenses, which = np.unique(lens, return_inverse=True)
+        start = np.concatenate([[0], np.cumsum(filled(np.bincount(which, minlength=lenses.size), GROUP))])
+        return start[which] + cell - np.maximum(starts[lens], first)
+
+    @cached_property
+    def _groups(self) -> int:
+        return int(self._line_of_cell.max(initial=-1)) // GROUP + 1
+
+    @cached_property
+    def _lines_of_rows(self) -> LitRows:
+        """The lit row cells in the order of their pixels."""
+        first, last = self._lit_rows
+        pixel = self.rows.cells.pixel[first:last]
+        order = np.argsort(pixel, kind="stable")
+        start = np.searchsorted(pixel[order], np.arange(self.rows.pixels + 1)).astype(np.int64)
+        return LitRows(start, first + order, self._line_of_cell[order])
+
+    @cached_property
+    def _runs(self) -> Index:
+        """The runs (runs, 5) of lit column cells side by side in a tile and a lens; see `kernels.fold_rows`."""
+        place = np.argsort(self.order)
+        cell = self.order[place].astype(np.int64)
+        step, tile = np.diff(place), place // TILE
+        beside = (np.diff(cell) == 1) & (np.abs(step) == 1) & (np.diff(tile) == 0)
+        beside &= ~np.isin(cell[1:], self.columns.cells.start)
+        beside[1:] &= ~beside[:-1] | (step[1:] == step[:-1])
+        begins = np.flatnonzero(np.append(True, ~beside)[: cell.size])
+        steps = np.append(np.where(beside, step, 1), 1)[begins]
+        pixel, counts = self.columns.cells.pixel[cell[begins]], np.diff(begins, append=cell.size)
+        return np.stack([cell[begins], place[begins], pixel, counts, steps], axis=1).astype(np.int64)
+
+    def _visits(self, blocks: Blocks, slab_of_block: Index, slabs: int) -> Visits:
+        """Return the visits of some blocks, those of a tile and a slab together."""
+        first = np.concatenate([[0], np.cumsum(blocks.planes)])
+        plane, voxel = np.divmod(line_of(self.columns), self.columns.voxels)
+        block = np.searchsorted(first, plane, side="right") - 1
+        rank = np.zeros(self.columns.cells.pixel.size, np.int64)
+        rank[self.order] = np.arange(self.order.size)
+        tile, cell = np.divmod(rank[self.columns.cell], TILE)
+        tiles, count = filled(self.order.size, TILE) // TILE, blocks.plane.size
+        keys, of_entry = np.unique((tile * slabs + slab_of_block[block]) * count + block, return_inverse=True)
+        of_tile = np.searchsorted(keys, count * np.arange(tiles * slabs + 1)).astype(np.int64)
+        return Visits(of_tile, keys % count, of_entry, plane - first[block], voxel, cell)
+
+    @cached_property
+    def _columns_forward(self) -> VisitsForward:
+        blocks, shape = self.forward_blocks
+        visits = self._visits(blocks, np.zeros(blocks.plane.size, np.int64), 1)
+        at = (visits.of_entry * shape.planes + visits.plane) * TILE + visits.cell
+        low, span = spans(at, visits.voxel, visits.block.size * shape.planes * TILE)
+        most = span.reshape(-1, LANES).max(axis=1)
+        start = np.concatenate([[0], np.cumsum(most)]).astype(np.int64)
+        block, lane = np.divmod(at, LANES)
+        low = np.minimum(low, self.columns.voxels - np.repeat(most, LANES))
+        shares = self.columns.share.reshape(at.size, -1)
+        share = np.zeros((start[-1], shares.shape[1], LANES), np.float32)
+        share[start[block] + visits.voxel - low[at], :, lane] = shares
+        return VisitsForward(visits.of_tile, visits.block, start, low.astype(np.int32), share)
+
+    @cached_property
+    def _columns_back(self) -> VisitsBack:
+        """The weights along the columns as sums over the cells of each tile."""
+        blocks, shape = self.back_blocks
+        slab = blocks.plane // shape.planes
+        visits = self._visits(blocks, slab, int(slab.max(initial=-1)) + 1)
+        owner = visits.of_entry * shape.planes + visits.plane
+        low, span = spans(owner, visits.voxel, visits.block.size * shape.planes)
+        owned = np.concatenate([[0], np.cumsum(span)]).astype(np.int64)
+        number = owned[owner] + visits.voxel - low[owner]
+        by_sum = np.argsort(number * TILE + visits.cell, kind="stable")
+        start = np.searchsorted(number[by_sum], np.arange(owned[-1] + 1)).astype(np.int64)
+        line = visits.cell[by_sum].astype(np.int32)
+        share = np.ascontiguousarray(self.columns.share.reshape(by_sum.size, -1)[by_sum])
+        return VisitsBack(visits.of_tile, visits.block, owned, low.astype(np.int32), start, line, share)
+
+    @cached_property
+    def _rows_forward(self) -> RowSums:
+        """For each `GROUP` row cells of a lens the lines of each block that reach any of them, and the shares."""
+        blocks, shape = self.forward_blocks
+        group, member = np.divmod(self._line_of_cell[self.rows.cell - self._lit_rows[0]], GROUP)
+        groups = self._groups
+        block, plane, line = self._block_lines(blocks)
+        line += plane * shape.lines
+        terms = packed(block * groups + group, line, member, self.rows.share, (blocks.plane.size * groups, GROUP))
+        some = np.flatnonzero(np.diff(terms.start))
+        start = np.append(terms.start[some], terms.start[-1])
+        of_block = np.searchsorted(some, groups * np.arange(blocks.plane.size + 1)).astype(np.int64)
+        return RowSums(of_block, some % max(groups, 1), terms._replace(start=start))
+
+    @cached_property
+    def _rows_back(self) -> Terms:
+        """For each line of a block and `GROUP` planes the lit row cells that it reaches, and the shares."""
+        blocks, shape = self.back_blocks
+        block, plane, line = self._block_lines(blocks)
+        pairs = shape.planes // GROUP
+        group = (block * shape.lines + line) * pairs + plane // GROUP
+        cell = self.rows.cell.astype(np.int64) - self._lit_rows[0]
+        sums = blocks.plane.size * shape.lines * pairs
+        return packed(group, cell, plane % GROUP, self.rows.share, (sums, GROUP))
+
+    def _block_lines(self, blocks: Blocks) -> tuple[Index, Index, Index]:
+        """Return the block of each entry of the weights along the rows, its plane in the block, and its line."""
+        first = np.concatenate([[0], np.cumsum(blocks.planes)])
+        plane, line = np.divmod(line_of(self.rows), self.rows.voxels)
+        block = np.searchsorted(first, plane, side="right") - 1
+        return block, plane - first[block], line
+
+
 @dataclass(frozen=True, eq=False)
 class FactorisedOperator:
     """Weights in factorised form.
@@ -95,21 +302,15 @@ class FactorisedOperator:
         """Return the image (rows, columns) of a volume [plane, row voxel, column voxel]."""
         ensure_own_threads()
         volume = real_array(volume, self.shape, "a volume")
-        first, last = self._lit_columns
-        tiles = filled(last - first, TILE) // TILE
         _, height, width = self.shape
-        turned = kernels.turned(volume, (width, filled(height, LANES)))
-        by_cell = kernels.project(turned, self._columns_forward, self._rows_forward, tiles)
-        return kernels.fold(by_cell, self.mask, self._runs, self._lines_of_rows, self.image_shape)
+        return self._products.project(kernels.turned(volume, (width, filled(height, LANES))))
 
     def adjoint(self, image: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return the volume [plane, row voxel, column voxel] that an image is spread back to."""
         ensure_own_threads()
         image = real_array(image, self.image_shape, "an image")
-        by_cell = kernels.unfold(image, self.mask, self._runs, self._lit_rows, self.rows.cells.pixel)
         planes, height, width = self.shape
-        turned = (planes, width, filled(height, LANES))
-        volume = kernels.back_project(by_cell, turned, self._rows_back, self._columns_back, get_num_threads())
+        volume = self._products.back_project(image, (planes, width, filled(height, LANES)))
         return kernels.turned(volume, (height, width))
 
     def column(self, plane: int, row_voxel: int, column_voxel: int) -> Column:
@@ -126,38 +327,15 @@ class FactorisedOperator:
         return rows[lit[0]].astype(np.int64), columns[lit[1]].astype(np.int64), weight[lit]
 
     @cached_property
-    def _lit_rows(self) -> tuple[int, int]:
-        """Range of row cells that any voxel reaches."""
-        return lit_range(self.rows.cell)
-
-    @cached_property
-    def _lit_columns(self) -> tuple[int, int]:
-        """Range of column cells that any voxel reaches."""
-        return lit_range(self.columns.cell)
-
-    @cached_property
-    def _runs(self) -> NDArray[np.int64]:
-        return runs_of_cells(self.columns.cells, *self._lit_columns)
-
-    @cached_property
-    def _lines_of_rows(self) -> LitRows:
-        return rows_of_pixels(self.rows, *self._lit_rows)
-
-    @cached_property
-    def _columns_forward(self) -> CellBlocks:
-        return blocks_of_cells(self.columns, *self._lit_columns)
-
-    @cached_property
-    def _columns_back(self) -> VoxelSums:
-        return sums_of_voxels(self.columns, *self._lit_columns)
-
-    @cached_property
-    def _rows_forward(self) -> Terms:
-        return row_terms_of_cells(self.rows, *self._lit_rows)
-
-    @cached_property
-    def _rows_back(self) -> Terms:
-        return row_terms_of_voxels(self.rows, self._lit_rows[0])
+    def _products(self) -> BlockProducts:
+        planes, height, _ = self.shape
+        blocks = []
+        for most in (PLANES_FORWARD, PLANES_BACK):
+            first = np.arange(0, planes, most)
+            where = Blocks(first, np.minimum(planes - first, most), np.zeros_like(first))
+            blocks.append((where, BlockShape(most, filled(height, LANES))))
+        order = np.arange(*lit_range(self.columns.cell), dtype=np.int32)
+        return BlockProducts(self.columns, self.rows, self.mask, order, *blocks)
 
 
 @dataclass(frozen=True, eq=False)
@@ -218,43 +396,6 @@ def adjoint_reference(operator: FactorisedOperator, image: NDArray[np.float32]) 
     return np.stack([operator.rows.matrix(k).T @ by_cell @ operator.columns.matrix(k) for k in planes])
 
 
-def runs_of_cells(cells: Cells, first: int, last: int) -> NDArray[np.int64]:
-    """Return the runs (runs, 4) of lit cells (from `first` to `last`) that share a tile and a lens; see `fold`."""
-    cell = np.arange(first, last)
-    begins = np.isin(cell, cells.start) | ((cell - first) % TILE == 0)
-    begin = cell[begins]
-    return np.stack([begin, begin - first, cells.pixel[begin], np.diff(begin, append=last)], axis=1).astype(np.int64)
-
-
-def blocks_of_cells(columns: AxisWeights, first: int, last: int) -> CellBlocks:
-    """Return the columns' weights as blocks of `LANES` lit cells (from `first` to `last`), each with its voxels."""
-    pieces = filled(last - first, TILE) // LANES
-    plane, voxel = np.divmod(line_of(columns), columns.voxels)
-    tile, cell = np.divmod(columns.cell.astype(np.int64) - first, TILE)
-    at = (tile * columns.planes + plane) * TILE + cell
-    low, span = spans(at, voxel, columns.planes * pieces * LANES)
-    most = span.reshape(-1, LANES).max(axis=1)
-    start = np.concatenate([[0], np.cumsum(most)]).astype(np.int64)
-    block, lane = np.divmod(at, LANES)
-    low = np.minimum(low, columns.voxels - np.repeat(most, LANES))
-    share = np.zeros((start[-1], LANES), np.float32)
-    share[start[block] + voxel - low[at], lane] = columns.share
-    return CellBlocks(start, low.astype(np.int32), share)
-
-
-def sums_of_voxels(columns: AxisWeights, first: int, last: int) -> VoxelSums:
-    """Return the columns' weights as sums over the cells of each tile of lit cells (from `first` to `last`)."""
-    tiles = filled(last - first, TILE) // TILE
-    plane, voxel = np.divmod(line_of(columns), columns.voxels)
-    tile, cell = np.divmod(columns.cell.astype(np.int64) - first, TILE)
-    owner = tile * columns.planes + plane
-    low, span = spans(owner, voxel, columns.planes * tiles)
-    owned = np.concatenate([[0], np.cumsum(span)]).astype(np.int64)
-    number = owned[owner] + voxel - low[owner]
-    terms = packed(number, cell, np.zeros_like(cell), columns.share, (int(owned[-1]), 1))
-    return VoxelSums(owned, low.astype(np.int32), *terms)
-
-
 def spans(
     owner: NDArray[np.int64], place: NDArray[np.int64], owners: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -264,49 +405,6 @@ def spans(
     np.maximum.at(high, owner, place)
     low[high < 0] = 0
     return low, high - low + 1
-
-
-def lens_lines(rows: AxisWeights, first: int, last: int) -> NDArray[np.int64]:
-    """Return the line of each lit cell in the sum: no group spans two lenses, whose voxels differ."""
-    cell = np.arange(first, last)
-    lens = np.searchsorted(rows.cells.start, cell, side="right") - 1
-    begin = np.maximum(rows.cells.start[lens], first)
-    lenses, which = np.unique(lens, return_inverse=True)
-    start = np.concatenate([[0], np.cumsum(filled(np.bincount(which, minlength=lenses.size), GROUP))])
-    return start[which] + cell - begin
-
-
-def rows_of_pixels(rows: AxisWeights, first: int, last: int) -> LitRows:
-    """Return the lit row cells (from `first` to `last`) in the order of their pixels."""
-    pixel = rows.cells.pixel[first:last]
-    order = np.argsort(pixel, kind="stable")
-    start = np.searchsorted(pixel[order], np.arange(rows.pixels + 1)).astype(np.int64)
-    return LitRows(start, first + order, lens_lines(rows, first, last)[order])
-
-
-def row_terms_of_cells(rows: AxisWeights, first: int, last: int) -> Terms:
-    """Return, for each `GROUP` row cells of a lens, the lines of the volume that reach any of them, and the shares.
-
-    `first` and `last` bound the lit cells; a line is plane * filled height + voxel, with the planes of each
-    `PLANES_FORWARD` counted on their own, whose terms follow each other.
-    """
-    line_of_cell = lens_lines(rows, first, last)
-    group, member = np.divmod(line_of_cell[rows.cell - first], GROUP)
-    groups = int(line_of_cell[-1]) // GROUP + 1
-    plane, voxel = np.divmod(line_of(rows), rows.voxels)
-    chunk, plane = np.divmod(plane, PLANES_FORWARD)
-    line = plane * filled(rows.voxels, LANES) + voxel
-    return packed(chunk * groups + group, line, member, rows.share, (_chunks(rows, PLANES_FORWARD) * groups, GROUP))
-
-
-def row_terms_of_voxels(rows: AxisWeights, first: int) -> Terms:
-    """Return, for each voxel of each `GROUP` planes, the lit row cells it reaches (from `first` on) and the shares."""
-    plane, voxel = np.divmod(line_of(rows), rows.voxels)
-    chunk, plane = np.divmod(plane, PLANES_BACK)
-    height, pairs = filled(rows.voxels, LANES), PLANES_BACK // GROUP
-    cell = rows.cell.astype(np.int64) - first
-    group = (chunk * height + voxel) * pairs + plane // GROUP
-    return packed(group, cell, plane % GROUP, rows.share, (_chunks(rows, PLANES_BACK) * height * pairs, GROUP))
 
 
 def packed(
@@ -323,11 +421,6 @@ def packed(
     packed = np.zeros((keys.size, shape[1]), np.float32)
     packed[term, member] = share
     return Terms(start, (keys % lines).astype(np.int32), packed)
-
-
-def _chunks(axis: AxisWeights, planes: int) -> int:
-    """Return how many times so many planes there are, the last time perhaps fewer."""
-    return filled(axis.planes, planes) // planes
 
 
 def filled(size: Any, multiple: int) -> Any:

@@ -19,12 +19,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from lfpiv_cli.optics.camera import Camera, KernelCamera
 from lfpiv_cli.optics.curved_space import CurvedSpace
-from lfpiv_cli.optics.ray_bundles import aim_all
+from lfpiv_cli.optics.ray_bundles import aim
 from lfpiv_cli.optics.surfaces import Faces
 from lfpiv_cli.optics.tracing import ObjectSpace, slope_ratio, struck_pixel, trace_ray
 from lfpiv_cli.threads import share_out
 from lfpiv_cli.weights.lens_cells import MOST_CORNERS, shared_rectangle
-from lfpiv_cli.weights.scene import Scene, Source, kernel_scene, on_array, on_sensor, rays_at_depth, rays_from
+from lfpiv_cli.weights.scene import NO_FACES, Scene, Source, kernel_scene, on_array, on_sensor, rays_at_depth, rays_from
 
 # Tiles across the aperture: with 32 a tile is seen as half a pixel of Table 2's camera and columns are off by 0.01 to
 # 0.02 in L1 (0.04 at 11 mm from focus), with 64 by 0.003 to 0.005, with 256 by 0.0002 (0.0008).
@@ -102,7 +102,10 @@ def integrate_columns(
     pixels, shares, counts = [], [], []
     first = 0
     while first < len(centres):
-        last = _block_end(boxes, first)
+        # The run of voxels whose pictures fit into the memory.
+        height, width = np.maximum.accumulate(boxes[first:, 2:] - boxes[first:, :2], axis=0).T
+        bytes_needed = 8 * height * width * np.arange(1, height.size + 1)
+        last = first + max(1, int(np.searchsorted(bytes_needed, BLOCK_BYTES)))
         pictures = np.zeros((last - first, *(boxes[first:last, 2:] - boxes[first:last, :2]).max(axis=0)))
         share_out(_fill, len(pictures), scene, boxes, first, pictures)
         voxel, row, column = np.nonzero(pictures > SMALLEST_SHARE)
@@ -116,13 +119,6 @@ def integrate_columns(
         np.concatenate([*pixels, []]).astype(np.int32),
         np.concatenate([*shares, np.zeros(0, np.float32)]),
     )
-
-
-def _block_end(boxes: NDArray[np.int64], first: int) -> int:
-    """Return the end of the run of voxels from `first` whose pictures fit into `BLOCK_BYTES`."""
-    height, width = np.maximum.accumulate(boxes[first:, 2:] - boxes[first:, :2], axis=0).T
-    bytes_needed = 8 * height * width * np.arange(1, height.size + 1)
-    return first + max(1, int(np.searchsorted(bytes_needed, BLOCK_BYTES)))
 
 
 @njit(cache=True)
@@ -154,14 +150,7 @@ def _half_face(scene: Scene, point: NDArray[np.float64], plane: int, node: int) 
 
 @njit(cache=True, nogil=True)
 def _set_boxes(part: tuple[int, int], scene: Scene, boxes: NDArray[np.int64]) -> None:
-    """Set what of the sensor voxels `part` can light: (n, 4) first row and column, and those behind."""
-    for n in range(part[0], part[1]):
-        _set_box(scene, scene.centres_mm[n], scene.plane[n], boxes[n])
-
-
-@njit(cache=True)
-def _set_box(scene: Scene, centre: NDArray[np.float64], plane: int, box: NDArray[np.int64]) -> None:
-    """Set the box (4,) of a voxel.
+    """Set what of the sensor voxels `part` can light: (n, 4) first row and column, and those behind.
 
     Found from the rays through the rim: light under a lens stays within the aperture's image about its centre. That of
     a voxel whose middle lies outside the fluid is empty.
@@ -169,29 +158,31 @@ def _set_box(scene: Scene, centre: NDArray[np.float64], plane: int, box: NDArray
     camera = scene.camera
     radius, cell, pixel = camera.aperture_radius_mm, scene.cell_radius_mm, camera.pixel_mm
     tilt = camera.microlens_distance_mm / camera.image_distance_mm
-    low, high = np.full(2, np.inf), np.full(2, -np.inf)
-    point = centre.copy()
-    if rays_from(scene, centre, plane, 0).shape[1] == 0:
-        box[:] = 0
-        return
-    for k in range(scene.depth_share.size):
-        rays = rays_at_depth(scene, centre, plane, k, point)
-        half = _half_face(scene, point, plane, k)
-        for m in range(RIM_RAYS):
-            angle = 2.0 * np.pi * m / RIM_RAYS
-            x, y = on_array(scene, point, rays, radius * np.cos(angle), radius * np.sin(angle))
-            distorted = 1.0 + camera.distortion_per_mm2 * (x * x + y * y)
-            low[0], high[0] = min(low[0], x * distorted - half[0]), max(high[0], x * distorted + half[0])
-            low[1], high[1] = min(low[1], y * distorted - half[1]), max(high[1], y * distorted + half[1])
     # One pixel more than the geometry asks for covers rays between those followed, and the distortion's bend.
     spread = abs(1.0 + tilt - camera.microlens_distance_mm / camera.microlens_focal_length_mm)
     beyond = tilt * radius + spread * cell + pixel
-    for axis in range(2):
-        size = camera.columns if axis == 0 else camera.rows
-        first = int(np.floor(((low[axis] - cell) * (1.0 + tilt) - beyond) / pixel + 0.5 * size))
-        last = int(np.floor(((high[axis] + cell) * (1.0 + tilt) + beyond) / pixel + 0.5 * size)) + 1
-        box[1 - axis] = min(max(first, 0), size)
-        box[3 - axis] = min(max(last, 0), size)
+    for n in range(part[0], part[1]):
+        centre, plane, box = scene.centres_mm[n], scene.plane[n], boxes[n]
+        low, high = np.full(2, np.inf), np.full(2, -np.inf)
+        point = centre.copy()
+        if rays_from(scene, centre, plane, 0).shape[1] == 0:
+            box[:] = 0
+            continue
+        for k in range(scene.depth_share.size):
+            rays = rays_at_depth(scene, centre, plane, k, point)
+            half = _half_face(scene, point, plane, k)
+            for m in range(RIM_RAYS):
+                angle = 2.0 * np.pi * m / RIM_RAYS
+                x, y = on_array(scene, point, rays, radius * np.cos(angle), radius * np.sin(angle))
+                distorted = 1.0 + camera.distortion_per_mm2 * (x * x + y * y)
+                low[0], high[0] = min(low[0], x * distorted - half[0]), max(high[0], x * distorted + half[0])
+                low[1], high[1] = min(low[1], y * distorted - half[1]), max(high[1], y * distorted + half[1])
+        for axis in range(2):
+            size = camera.columns if axis == 0 else camera.rows
+            first = int(np.floor(((low[axis] - cell) * (1.0 + tilt) - beyond) / pixel + 0.5 * size))
+            last = int(np.floor(((high[axis] + cell) * (1.0 + tilt) + beyond) / pixel + 0.5 * size)) + 1
+            box[1 - axis] = min(max(first, 0), size)
+            box[3 - axis] = min(max(last, 0), size)
 
 
 @njit(cache=True, nogil=True)
@@ -199,25 +190,18 @@ def _fill(
     part: tuple[int, int], scene: Scene, boxes: NDArray[np.int64], first: int, pictures: NDArray[np.float64]
 ) -> None:
     """Add up the light of the voxels from `first` on in pictures `part` of (voxels, rows, columns of their boxes)."""
-    for n in range(part[0], part[1]):
-        _fill_picture(scene, first + n, boxes[first + n], pictures[n])
-
-
-@njit(cache=True)
-def _fill_picture(scene: Scene, voxel: int, box: NDArray[np.int64], picture: NDArray[np.float64]) -> None:
-    """Add up the light of a voxel in a picture of its box."""
-    if box[0] == box[2] or box[1] == box[3]:
-        return
-    plane, point = scene.plane[voxel], scene.centres_mm[voxel].copy()
     work = np.empty((2, MOST_CORNERS, 2))
     lines = np.empty((2, MOST_PIXELS))
-    for k in range(scene.depth_share.size):
-        rays = rays_at_depth(scene, scene.centres_mm[voxel], plane, k, point)
-        half = _half_face(scene, point, plane, k)
-        for t in range(scene.tile_share.size):
-            x, y = on_array(scene, point, rays, scene.tile_mm[t, 0], scene.tile_mm[t, 1])
-            tile = (scene.tile_mm[t, 0], scene.tile_mm[t, 1], scene.tile_share[t] * scene.depth_share[k])
-            _add_tile(scene, (x, y, half[0], half[1]), tile, box, work, lines, picture)
+    for n in range(part[0], part[1]):
+        voxel, box = first + n, boxes[first + n]
+        plane, point = scene.plane[voxel], scene.centres_mm[voxel].copy()
+        for k in range(0 if box[0] == box[2] or box[1] == box[3] else scene.depth_share.size):
+            rays = rays_at_depth(scene, scene.centres_mm[voxel], plane, k, point)
+            half = _half_face(scene, point, plane, k)
+            for t in range(scene.tile_share.size):
+                x, y = on_array(scene, point, rays, scene.tile_mm[t, 0], scene.tile_mm[t, 1])
+                tile = (scene.tile_mm[t, 0], scene.tile_mm[t, 1], scene.tile_share[t] * scene.depth_share[k])
+                _add_tile(scene, (x, y, half[0], half[1]), tile, box, work, lines, pictures[n])
 
 
 @njit(cache=True)
@@ -321,8 +305,6 @@ def _ramp(t: float, width: float) -> float:
 
 # Points are counted in this many parts side by side, each into an image of its own.
 PARTS = 8
-# Rays of one point that are traced together behind curved faces: their arrays stay in the first-level cache.
-RAYS_AT_ONCE = 256
 
 # splitmix64 (Steele, Lea and Flood 2014): a counter's step and two mixing factors; every ray has numbers of its own,
 # whoever computes it.
@@ -372,12 +354,13 @@ def count_rays(
     seeds = rng.integers(0, 2**64, count.points, dtype=np.uint64)
     counts = np.zeros((PARTS, camera.rows * camera.columns), np.int64)
     rays = (starts, seeds, count.rays_per_point)
+    faces, nodes, factors = NO_FACES, np.zeros((count.points, 1)), np.zeros((count.points, 1))
     if isinstance(space, CurvedSpace):
-        share_out(_count_curved, PARTS, rays, space.for_kernels(camera), camera.for_kernels(), counts)
-        return counts.sum(axis=0).reshape(camera.rows, camera.columns) / count.rays
-    reach = camera.aperture_radius_mm + float(np.hypot(*(np.abs(centre[:2]) + sides[:2])))
-    nodes, factors = space.slope_polynomials(camera, starts[:, 2], reach)
-    share_out(_count, PARTS, rays, nodes, factors, camera.for_kernels(), counts)
+        faces = space.for_kernels(camera)
+    else:
+        reach = camera.aperture_radius_mm + float(np.hypot(*(np.abs(centre[:2]) + sides[:2])))
+        nodes, factors = space.slope_polynomials(camera, starts[:, 2], reach)
+    share_out(_count, PARTS, rays, faces, nodes, factors, camera.for_kernels(), counts)
     return counts.sum(axis=0).reshape(camera.rows, camera.columns) / count.rays
 
 
@@ -419,47 +402,11 @@ def unit_random(state: np.uint64) -> float:
     return float(z >> np.uint64(11)) * TO_UNIT
 
 
-@njit(cache=True)
-def random_crossing(state: np.uint64, radius: float) -> tuple[float, float]:
-    """Return a point of the main lens that belongs to a counter, which goes on by `TWO_STEPS`."""
-    r = radius * np.sqrt(unit_random(state + STEP))
-    angle = 2.0 * np.pi * unit_random(state + TWO_STEPS)
-    return r * np.cos(angle), r * np.sin(angle)
-
-
-@njit(cache=True, nogil=True)
-def _count_curved(
-    parts: tuple[int, int],
-    rays: tuple[NDArray[np.float64], NDArray[np.uint64], int],
-    faces: Faces,
-    camera: KernelCamera,
-    counts: NDArray[np.int64],
-) -> None:
-    """Add up the rays behind curved faces that strike each pixel; the arguments are those of `_count`."""
-    starts, seeds, rays_each = rays
-    for part in range(parts[0], parts[1]):
-        for n in range(part, starts.shape[0], PARTS):
-            state = seeds[n]
-            for first in range(0, rays_each, RAYS_AT_ONCE):
-                count = min(RAYS_AT_ONCE, rays_each - first)
-                start, crossing = np.empty((count, 3)), np.empty((count, 2))
-                start[:] = starts[n]
-                for k in range(count):
-                    crossing[k, 0], crossing[k, 1] = random_crossing(state, camera.aperture_radius_mm)
-                    state += TWO_STEPS
-                slopes, seen = aim_all(faces, start, crossing)
-                for k in range(count):
-                    if seen[k]:
-                        x, y = trace_ray(camera, crossing[k, 0], crossing[k, 1], slopes[k, 0], slopes[k, 1])
-                        pixel = struck_pixel(camera, x, y)
-                        if pixel >= 0:
-                            counts[part, pixel] += 1
-
-
 @njit(cache=True, nogil=True)
 def _count(
     parts: tuple[int, int],
     rays: tuple[NDArray[np.float64], NDArray[np.uint64], int],
+    faces: Faces,
     nodes: NDArray[np.float64],
     factors: NDArray[np.float64],
     camera: KernelCamera,
@@ -473,13 +420,20 @@ def _count(
     radius = camera.aperture_radius_mm
     for part in range(parts[0], parts[1]):
         for n in range(part, starts.shape[0], PARTS):
-            state = seeds[n]
+            x, y, z, state = starts[n, 0], starts[n, 1], starts[n, 2], seeds[n]
             for _ in range(rays_each):
-                lens_x, lens_y = random_crossing(state, radius)
+                # A point of the main lens that belongs to the counter.
+                r, angle = radius * np.sqrt(unit_random(state + STEP)), 2.0 * np.pi * unit_random(state + TWO_STEPS)
+                lens_x, lens_y = r * np.cos(angle), r * np.sin(angle)
                 state += TWO_STEPS
-                dx, dy = lens_x - starts[n, 0], lens_y - starts[n, 1]
-                ratio = slope_ratio(dx * dx + dy * dy, nodes[n], factors[n])
-                x, y = trace_ray(camera, lens_x, lens_y, ratio * dx, ratio * dy)
-                pixel = struck_pixel(camera, x, y)
-                if pixel >= 0:
-                    counts[part, pixel] += 1
+                if faces.ratios.size > 0:
+                    slope_x, slope_y, seen = aim(faces, x, y, z, lens_x, lens_y)
+                else:
+                    dx, dy = lens_x - x, lens_y - y
+                    ratio = slope_ratio(dx * dx + dy * dy, nodes[n], factors[n])
+                    slope_x, slope_y, seen = ratio * dx, ratio * dy, True
+                if seen:
+                    sensor_x, sensor_y = trace_ray(camera, lens_x, lens_y, slope_x, slope_y)
+                    pixel = struck_pixel(camera, sensor_x, sensor_y)
+                    if pixel >= 0:
+                        counts[part, pixel] += 1

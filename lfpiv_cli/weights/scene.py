@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.camera import Camera, KernelCamera
 from lfpiv_cli.optics.curved_space import CurvedSpace
-from lfpiv_cli.optics.ray_bundles import aim, aim_all
+from lfpiv_cli.optics.ray_bundles import aim
 from lfpiv_cli.optics.surfaces import Faces
 from lfpiv_cli.optics.tracing import (
     SLOPE_NODES,
@@ -29,7 +29,7 @@ from lfpiv_cli.optics.tracing import (
     slope_ratio,
 )
 from lfpiv_cli.threads import share_out
-from lfpiv_cli.weights.lens_cells import cell_radius, disc_area_below, neighbours
+from lfpiv_cli.weights.lens_cells import disc_area_below, neighbours
 
 # Where rays behind curved faces meet the array, and which voxels are seen at all.
 #
@@ -176,6 +176,8 @@ def kernel_scene(
     ConfigError : a voxel in front of the fluid, or no window where one is needed
     """
     tiles = aperture_tiles(camera.aperture_radius_mm, tiles_per_side)
+    # A lens's region reaches as far as half the basis cell's long diagonal.
+    first, second = camera.lattice.basis
     depth, plane = np.unique(centres[:, 2], return_inverse=True)
     place, weight = np.polynomial.legendre.leggauss(depth_nodes)
     z = depth[:, np.newaxis] + 0.5 * sides[2] * place
@@ -210,7 +212,7 @@ def kernel_scene(
         tile_mm=tiles.middle_mm,
         tile_share=tiles.share,
         tile_side_mm=tiles.side_mm,
-        cell_radius_mm=cell_radius(camera.lattice),
+        cell_radius_mm=0.5 * float(max(np.hypot(*(first + second)), np.hypot(*(first - second)))),
         neighbours_mm=neighbours(camera.lattice),
     )
 
@@ -240,43 +242,35 @@ def rays_from(scene: Scene, point: NDArray[np.float64], plane: int, node: int) -
     for both coordinates on the array the polynomial in X and Y alone, (2, degree + 1, degree + 1) by the powers of X
     and Y; (2, 0, 0) for a point outside the fluid, or not seen through the whole aperture.
     """
+    size = scene.degree + 1
     if scene.aimed_mm.shape[0] > 0:
-        return _rays_traced_from(scene, point)
+        rays = np.zeros((2, size, size))
+        f_m, s_i = scene.camera.focal_length_mm, scene.camera.image_distance_mm
+        for m in range(scene.aimed_mm.shape[0]):
+            lens_x, lens_y = scene.aimed_mm[m, 0], scene.aimed_mm[m, 1]
+            slope_x, slope_y, seen = aim(scene.faces, point[0], point[1], point[2], lens_x, lens_y)
+            if not seen:
+                return np.zeros((2, 0, 0))
+            x, y = lens_x + s_i * (slope_x - lens_x / f_m), lens_y + s_i * (slope_y - lens_y / f_m)
+            for a in range(size):
+                for b in range(size - a):
+                    share = scene.aimed_fit[a * size + b, m]
+                    rays[0, a, b] += share * x
+                    rays[1, a, b] += share * y
+        return rays
     if scene.degree == 0:
         rays = np.empty((2, 1, SLOPE_NODES))
         for table in range(2):
             for k in range(SLOPE_NODES):
                 rays[table, 0, k] = scene.slopes[plane, node, table, k]
         return rays
-    rays = np.zeros((2, scene.degree + 1, scene.degree + 1))
+    rays = np.zeros((2, size, size))
     for k in range(scene.exponents.shape[0]):
         term = 1.0
         for m in range(3):
             term *= (point[m] / scene.scale_mm[m]) ** scene.exponents[k, m]
         for axis in range(2):
             rays[axis, scene.exponents[k, 3], scene.exponents[k, 4]] += scene.coefficients_mm[k, axis] * term
-    return rays
-
-
-@njit(cache=True)
-def _rays_traced_from(scene: Scene, point: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the polynomial in X and Y of `rays_from` behind curved faces."""
-    size = scene.degree + 1
-    rays = np.zeros((2, size, size))
-    f_m, s_i = scene.camera.focal_length_mm, scene.camera.image_distance_mm
-    start = np.empty((scene.aimed_mm.shape[0], 3))
-    start[:] = point
-    slopes, seen = aim_all(scene.faces, start, scene.aimed_mm)
-    if not seen.all():
-        return np.zeros((2, 0, 0))
-    for m in range(scene.aimed_mm.shape[0]):
-        lens_x, lens_y = scene.aimed_mm[m, 0], scene.aimed_mm[m, 1]
-        x, y = lens_x + s_i * (slopes[m, 0] - lens_x / f_m), lens_y + s_i * (slopes[m, 1] - lens_y / f_m)
-        for a in range(size):
-            for b in range(size - a):
-                share = scene.aimed_fit[a * size + b, m]
-                rays[0, a, b] += share * x
-                rays[1, a, b] += share * y
     return rays
 
 

@@ -8,7 +8,7 @@ Axes: image axes (x along the columns), mm, z away from the camera from the nomi
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import product
 from typing import NamedTuple
@@ -19,8 +19,9 @@ from numpy.typing import NDArray
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.curved_space import CurvedSpace
-from lfpiv_cli.simd.combine import TILE
+from lfpiv_cli.simd import GROUP, TILE
 from lfpiv_cli.weights.axis import axis_weights, depth_nodes
+from lfpiv_cli.weights.kernels import PLACES, SLAB, STRIP, Blocks
 from lfpiv_cli.weights.lens_cells import AxisOptics, Cells, aperture_mask, micro_image_cells
 from lfpiv_cli.weights.quadrature import integrate_columns
 from lfpiv_cli.weights.scene import lit_voxels, places_on_array
@@ -37,9 +38,15 @@ from lfpiv_cli.weights.strip_fits import (
     strip_rays,
     through_lines,
 )
-from lfpiv_cli.weights.strip_kernels import PLACES, SLAB, STRIP, Blocks
-from lfpiv_cli.weights.strips import FINE_PARTS, StripOperator, part_of_cells, sorted_cells
+from lfpiv_cli.weights.strips import StripOperator
 
+# Column cells are sorted by which part of the aperture they see, so that those of a tile see the same: light through
+# one part then comes from some of the tiles only.
+
+
+# Parts of the aperture, side by side: by those along the strips column cells are sorted, and blocks have some
+# neighbouring ones of those across.
+PARTS, FINE_PARTS = 6, 12
 # Rays of each part of a strip.
 RAYS = 8192
 # Into how many parts the aperture is cut across the strips, for the factors along them; and how many tiles of column
@@ -126,35 +133,37 @@ def strip_scene(
     cells = micro_image_cells(optics[0]), micro_image_cells(optics[1])
     lines, across = (lit.swapaxes(1, 2), 0) if turned else (lit, 1)
     radius, along = camera.aperture_radius_mm, 1 - across
-    order = sorted_cells(cells[along], _lenses_reached(camera, space, grid, optics[along], along), radius)
-    tile = np.full(cells[along].pixel.size, -1)
+    # The lenses that light from the grid can come to, by rays from all over it.
+    even, axis = evenly_spread(RAYS, 5), optics[along]
+    bounds = camera.to_image_axes(np.array([grid.bounds_mm(k) for k in range(3)]).T)
+    angle, away = 2.0 * np.pi * even[:, 3], radius * np.sqrt(even[:, 4])
+    crossing = np.stack([away * np.cos(angle), away * np.sin(angle)], axis=1)
+    array, valid = places_on_array(camera, space, bounds[0] + even[:, :3] * (bounds[1] - bounds[0]), crossing)
+    lenses = 0, -1
+    if valid.any():
+        place = array[valid, along] * (1.0 + camera.distortion_per_mm2 * np.sum(array[valid] ** 2, axis=1))
+        low, high = (np.array([place.min(), place.max()]) - axis.lens_origin_mm) / axis.lens_pitch_mm
+        lenses = int(np.floor(low)) - LENSES_BESIDE, int(np.ceil(high)) + LENSES_BESIDE
+    # Their cells by what part of the aperture they see; to and fro, so that neighbours are of neighbouring lenses.
+    own, starts = cells[along], cells[along].start
+    first, last = (int(np.clip(n - own.first_lens, 0, starts.size - 1)) for n in (lenses[0], lenses[1] + 1))
+    cell = np.arange(starts[first], starts[last])
+    sees = part_of_cells(own, radius, PARTS)[cell]
+    order = cell[np.lexsort((np.where(sees % 2, -cell, cell), sees))].astype(np.int32)
+    tile = np.full(own.pixel.size, -1)
     tile[order] = np.arange(order.size) // TILE
     part = part_of_cells(cells[across], radius, FINE_PARTS)
     return StripScene(camera, space, grid, optics, cells, order, tile, part, lines, across)
 
 
-def _lenses_reached(camera: Camera, space: CurvedSpace, grid: Grid, optics: AxisOptics, axis: int) -> tuple[int, int]:
-    """Return the first and the last number of the lenses that light from a grid can come to along an image axis."""
-    even = evenly_spread(RAYS, 5)
-    bounds = camera.to_image_axes(np.array([grid.bounds_mm(k) for k in range(3)]).T)
-    angle, radius = 2.0 * np.pi * even[:, 3], camera.aperture_radius_mm * np.sqrt(even[:, 4])
-    crossing = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
-    array, valid = places_on_array(camera, space, bounds[0] + even[:, :3] * (bounds[1] - bounds[0]), crossing)
-    if not valid.any():
-        return 0, -1
-    place = array[valid, axis] * (1.0 + camera.distortion_per_mm2 * np.sum(array[valid] ** 2, axis=1))
-    low, high = (np.array([place.min(), place.max()]) - optics.lens_origin_mm) / optics.lens_pitch_mm
-    return int(np.floor(low)) - LENSES_BESIDE, int(np.ceil(high)) + LENSES_BESIDE
-
-
-def make_blocks(scene: StripScene) -> list[Block]:
-    """Return the blocks of a volume; voxels that no rays were found for are taken out of `scene.lit`."""
-    planes, lines, _ = scene.lit.shape
-    blocks: list[Block] = []
-    for plane in range(0, planes, SLAB):
-        for line in range(0, lines, STRIP):
-            blocks += _blocks_of(scene, slice(plane, min(plane + SLAB, planes)), slice(line, min(line + STRIP, lines)))
-    return blocks
+def part_of_cells(cells: Cells, radius_mm: float, parts: int) -> NDArray[np.int64]:
+    """Return which of so many equal parts of the aperture each cell sees; that of two that share their sums is one."""
+    middle = cells.patch_mm.mean(axis=1)
+    lens = np.searchsorted(cells.start, np.arange(middle.size), side="right") - 1
+    pair = cells.start[lens] + (np.arange(middle.size) - cells.start[lens]) // GROUP * GROUP
+    other = np.minimum(pair + GROUP - 1, cells.start[lens + 1] - 1)
+    middle = 0.5 * (middle[pair] + middle[other])
+    return np.clip((middle + radius_mm) * parts / (2.0 * radius_mm), 0, parts - 1).astype(np.int64)
 
 
 def _blocks_of(scene: StripScene, planes: slice, lines: slice) -> list[Block]:
@@ -194,11 +203,6 @@ def rays_of(scene: StripScene, planes: slice, lines: slice, rays: int) -> StripR
     return strip_rays(scene.camera, scene.space, np.stack(centres, axis=1), ends, sides, scene.across, rays)
 
 
-def part_of(places_mm: NDArray[np.float64], radius_mm: float, parts: int) -> NDArray[np.int64]:
-    """Return in which of so many parts of the aperture places on the main lens lie."""
-    return np.clip((places_mm + radius_mm) * parts / (2.0 * radius_mm), 0, parts - 1).astype(np.int64)
-
-
 def stray(rays: StripRays, left_mm: NDArray[np.float64], pitch_mm: float) -> float:
     """Return the share of light that goes astray in the worst box of a part of a strip, by what a fit leaves (n,).
 
@@ -218,9 +222,9 @@ def stray(rays: StripRays, left_mm: NDArray[np.float64], pitch_mm: float) -> flo
 def fits_along(scene: StripScene, rays: StripRays) -> tuple[list[AxisFit], float]:
     """Return a fit along the strip for each part of the aperture across it, and the light that goes astray."""
     whole, left = fit_axis(rays, scene.along, DEGREE_ALONG)
-    crossing, pitch = rays.crossing_mm[:, scene.across], scene.optics[scene.along].lens_pitch_mm
+    crossing, radius, pitch = rays.crossing_mm[:, scene.across], rays.radius_mm, scene.optics[scene.along].lens_pitch_mm
     for parts in PARTS_ACROSS:
-        which = part_of(crossing, rays.radius_mm, parts)
+        which = np.clip((crossing + radius) * parts / (2.0 * radius), 0, parts - 1).astype(np.int64)
         fits, off = _fits_of_parts(whole, left, which, parts, pitch)
         if off < STRAY_ALONG:
             break
@@ -261,7 +265,15 @@ def _fits_across(scene: StripScene, rays: StripRays, degree_beside: int | None) 
     if degree_beside is not None:
         steps = int(np.ceil(whole.drift_mm() / (LARGEST_DRIFT * pitch)))
         places = rays.middle_mm[scene.along] + rays.half_mm[scene.along] * np.linspace(-1.0, 1.0, max(steps, 1) + 1)
-    tile, tiles = _tile_of_rays(scene, rays), -(-scene.order.size // TILE)
+    # The tile of the column cell that each ray comes to, or of one beside it.
+    cells, optics = scene.cells[scene.along], scene.optics[scene.along]
+    number = np.rint((rays.array_mm[:, scene.along] - optics.lens_origin_mm) / optics.lens_pitch_mm).astype(np.int64)
+    lens = np.clip(number - cells.first_lens, 0, cells.start.size - 2)
+    first, count = cells.start[lens], np.maximum(cells.start[lens + 1] - cells.start[lens], 1)
+    # The first pixel of a lens sees the far end of the aperture.
+    within = 0.5 * (1.0 - rays.crossing_mm[:, scene.along] / rays.radius_mm) * count
+    cell = np.minimum(first + np.clip(within.astype(np.int64), 0, count - 1), scene.tile.size - 1)
+    tile, tiles = np.maximum(scene.tile[cell], 0), -(-scene.order.size // TILE)
     for sharing in TILES_SHARING:
         fits, off = _fits_of_parts(whole, left, tile // sharing, -(-tiles // sharing), pitch)
         if off < STRAY_ACROSS:
@@ -278,18 +290,6 @@ def _fits_of_parts(
         fit, left[which == k] = fit_part(whole, left_mm, which == k)
         fits.append(fit)
     return fits, stray(whole.rays, left, pitch_mm)
-
-
-def _tile_of_rays(scene: StripScene, rays: StripRays) -> NDArray[np.int64]:
-    """Return the tile of the column cell that each ray comes to, or of one beside it."""
-    cells, optics = scene.cells[scene.along], scene.optics[scene.along]
-    number = np.rint((rays.array_mm[:, scene.along] - optics.lens_origin_mm) / optics.lens_pitch_mm).astype(np.int64)
-    lens = np.clip(number - cells.first_lens, 0, cells.start.size - 2)
-    first, count = cells.start[lens], np.maximum(cells.start[lens + 1] - cells.start[lens], 1)
-    # The first pixel of a lens sees the far end of the aperture.
-    within = 0.5 * (1.0 - rays.crossing_mm[:, scene.along] / rays.radius_mm) * count
-    cell = np.minimum(first + np.clip(within.astype(np.int64), 0, count - 1), scene.tile.size - 1)
-    return np.maximum(scene.tile[cell], 0)
 
 
 def _factors_along(
@@ -345,12 +345,6 @@ def _factors_across(
             yield tiles, share, Factor(counts, own.cell[kept], own.share[kept])
 
 
-def places_of(blocks: Sequence[Block]) -> Blocks:
-    """Return where blocks lie."""
-    plane, line, planes = ([b.plane for b in blocks], [b.line for b in blocks], [len(b.rows.counts) for b in blocks])
-    return Blocks(np.array(plane, np.int64), np.array(planes, np.int64), np.array(line, np.int64))
-
-
 # From camera, curved faces and a grid to the weights in strips: which way the strips run, and how good they are.
 #
 # Axes: grids in world axes, z away from the camera from the nominal focal point.
@@ -397,7 +391,14 @@ def strip_layout(camera: Camera, space: CurvedSpace, grid: Grid, optics: Optics)
 def _judged(scene: StripScene) -> tuple[float, float]:
     """Return the share of light that goes astray with as many parts as are needed, and their mean number."""
     off, parts = 0.0, []
-    for planes, lines in _some_parts(scene.lit.shape):
+    # Some parts of strips, all over the volume.
+    lines_from, planes_from = (
+        np.unique(np.linspace(0, size - 1, most).astype(int) // step * step)
+        for size, step, most in zip(scene.lit.shape[1::-1], (STRIP, SLAB), PARTS_JUDGED, strict=True)
+    )
+    for line, plane in product(lines_from, planes_from):
+        planes = slice(plane, min(plane + SLAB, scene.lit.shape[0]))
+        lines = slice(line, min(line + STRIP, scene.lit.shape[1]))
         if not scene.lit[planes, lines].any():
             continue
         rays = rays_of(scene, planes, lines, RAYS_JUDGED)
@@ -411,28 +412,26 @@ def _judged(scene: StripScene) -> tuple[float, float]:
     return (off, float(np.mean(parts))) if parts else (np.inf, 0.0)
 
 
-def _some_parts(shape: tuple[int, ...]) -> list[tuple[slice, slice]]:
-    """Return some parts of strips (planes, lines), all over the volume."""
-    firsts = [
-        np.unique(np.linspace(0, size - 1, most).astype(int) // step * step)
-        for size, step, most in zip((shape[1], shape[0]), (STRIP, SLAB), PARTS_JUDGED, strict=True)
-    ]
-    return [
-        (slice(plane, min(plane + SLAB, shape[0])), slice(line, min(line + STRIP, shape[1])))
-        for line in firsts[0]
-        for plane in firsts[1]
-    ]
-
-
 def factorise_strips(camera: Camera, space: CurvedSpace, grid: Grid, optics: Optics, turned: bool) -> StripOperator:
     """Return the weights of all voxels of a grid in strips."""
     lit = lit_voxels(camera, space, grid).copy()
     scene = strip_scene(camera, space, grid, optics, lit, turned)
-    blocks = make_blocks(scene)
+    planes, lines, _ = scene.lit.shape
+    blocks: list[Block] = []
+    # Voxels that no rays are found for are taken out of what is lit.
+    for plane in range(0, planes, SLAB):
+        for line in range(0, lines, STRIP):
+            blocks += _blocks_of(scene, slice(plane, min(plane + SLAB, planes)), slice(line, min(line + STRIP, lines)))
     columns = joined([each.columns for each in blocks], optics[scene.along], scene.cells[scene.along])
     rows = joined([each.rows for each in blocks], optics[scene.across], scene.cells[scene.across])
     mask = aperture_mask(columns.cells, rows.cells, camera.aperture_radius_mm)
-    operator = StripOperator(columns, rows, places_of(blocks), mask, scene.order, lit, turned, np.zeros(0))
+    where = (
+        [each.plane for each in blocks],
+        [len(each.rows.counts) for each in blocks],
+        [each.line for each in blocks],
+    )
+    places = Blocks(*(np.array(each, np.int64) for each in where))
+    operator = StripOperator(columns, rows, places, mask, scene.order, lit, turned, np.zeros(0))
     sample = sample_lit(camera, space, grid, lit, SAMPLE, np.random.default_rng(0))
     return replace(operator, misfit_l1=misfits_l1(operator, camera, space, grid, sample))
 
