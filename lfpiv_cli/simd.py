@@ -334,8 +334,9 @@ def _store_turned(builder: ir.IRBuilder, lines: Sequence[Any], out: Any, to: Seq
             pair = rows[m], rows[m + half]
             rows[m], rows[m + half] = (builder.shuffle_vector(*pair, _lanes(order)) for order in (low, high))
         half //= 2
+    at, step = to
     for n, row in enumerate(rows):
-        _store(builder, row, out, _step_on(builder, *to, n))
+        _store(builder, row, out, _step_on(builder, at, step, n))
 
 
 def _pointers(context: Any, builder: ir.IRBuilder, signature: Any, arguments: Any, positions: Sequence[int]) -> Any:
