@@ -9,8 +9,8 @@ from scipy.ndimage import gaussian_filter, shift
 
 from benchmarks.volumes import Seeding, volume_pair
 from lfpiv_cli.flow.moments import gauss_newton
-from lfpiv_cli.flow.sums import cells_of, margins, pair_moments
-from lfpiv_cli.flow.windows import WindowLayout, layout_windows
+from lfpiv_cli.flow.sums import margins, pair_moments
+from lfpiv_cli.flow.windows import WindowLayout, cells_of, layout_windows
 
 HALF = (0.5, 0.5, 0.5)
 SHAPE = (32, 40, 36)

@@ -172,7 +172,11 @@ def most_probable(
             name: weight if name == DIVERGENCE else min(weight, STRONGEST * first.weights[name])
             for name, weight in weights.items()
         }
-        onward = held(replace(updated, weights=weights), shape)
+        onward = replace(updated, weights=weights)
+        if DIVERGENCE in names:
+            # Not too large.
+            most = divergence_weight(onward, shape, STRONGEST_DIVERGENCE)
+            onward = replace(updated, weights={**weights, DIVERGENCE: min(weights[DIVERGENCE], most)})
         changes = [np.log(onward.weights[name] / expected.weights[name]) for name in names]
         changes += [np.log(updated.scale / expected.scale), np.log(updated.unresolved_mm / expected.unresolved_mm)]
         settled = float(np.abs(changes).max()) < LAST_STEP
@@ -187,14 +191,6 @@ def divergence_weight(expected: Expectation, lattice: Lattice, times: float) -> 
     wave = np.pi / float(np.max(lattice.cell_mm))
     smooth = sum(expected.weights[name] * wave ** (2 * order - 2) for name, order in ORDERS.items())
     return float(times * smooth)
-
-
-def held(expected: Expectation, lattice: Lattice) -> Expectation:
-    """Return the expectation with a weight of the divergence that is not too large."""
-    if DIVERGENCE not in expected.weights:
-        return expected
-    weight = min(expected.weights[DIVERGENCE], divergence_weight(expected, lattice, STRONGEST_DIVERGENCE))
-    return replace(expected, weights={**expected.weights, DIVERGENCE: weight})
 
 
 def _told(

@@ -19,8 +19,8 @@ import numpy as np
 from numba import njit
 
 from lfpiv_cli.arrays import Floats
-from lfpiv_cli.flow.sums import MOMENTS, PRODUCTS, UNKNOWNS, cells_of
-from lfpiv_cli.flow.windows import Triple, WindowLayout, triple
+from lfpiv_cli.flow.sums import MOMENTS, PRODUCTS, UNKNOWNS
+from lfpiv_cli.flow.windows import Triple, WindowLayout, cells_of, triple
 from lfpiv_cli.threads import share_out
 
 # A group is at least this many standard deviations of a particle image long: smaller ones share their particles, and

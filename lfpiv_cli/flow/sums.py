@@ -9,14 +9,14 @@ first-order error of a window whose particles leave it. R is at most 1 (Cauchy-S
 towards +.
 
 Windows that overlap share their products: where the step and the size have a large common divisor, products are summed
-over blocks of that size once, and blocks into windows. Axes: everything here is ordered (z, y, x).
+over blocks of that size once, and blocks into windows. In weighted windows every sum, of energies and moments too,
+counts a voxel by its weight, and neighbours share nothing. Axes: everything here is ordered (z, y, x).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
-from math import gcd
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -24,7 +24,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from lfpiv_cli.arrays import Floats
-from lfpiv_cli.flow.windows import Triple, WindowLayout, triple
+from lfpiv_cli.flow.windows import Cells, Starts, Triple, WindowLayout, cells_of, triple
 from lfpiv_cli.robust import of_half_the_sum
 from lfpiv_cli.threads import COUNT_NO_REFERENCES, in_threads, share_out
 
@@ -33,10 +33,6 @@ UNKNOWNS = 4
 PRODUCTS = UNKNOWNS * (UNKNOWNS + 1) // 2
 # And the squares of the slopes of their difference.
 MOMENTS = PRODUCTS + UNKNOWNS + 3
-# Blocks narrower than this cost more in sums of sums than the products they save.
-SMALLEST_BLOCK = 4
-# Cells along an axis of a window, at least, where it has as many voxels: groups enough for a variance.
-CELLS_PER_WINDOW = 4
 # Columns whose products are summed for all shifts before the next ones': their voxels stay in the fastest cache. And
 # shifts along x that share what is read: with five a radius of 2 takes one pass over a row.
 COLUMNS = 64
@@ -50,46 +46,7 @@ SMALLEST_AMPLITUDE = 0.07
 
 
 Row = NDArray[np.float32]
-Starts = tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]
 Weights = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]
-
-
-@dataclass(frozen=True, eq=False)
-class Cells:
-    """How the windows of one layout are made of cells, along (z, y, x).
-
-    Cell k along an axis covers `size[k]` voxels from `start[k]` on, counted from the first window's first voxel; window
-    k is the sum of cells k hop ... k hop + per_window - 1.
-    """
-
-    start: Starts
-    size: Starts
-    per_window: Triple
-    hop: Triple
-
-
-def cells_of(layout: WindowLayout, least: int = CELLS_PER_WINDOW, alone: Sequence[int] = ()) -> Cells:
-    """Return the cells that make up the windows, axis by axis.
-
-    Windows share cells of their step's and size's common divisor, or parts of these; where it is small or windows are
-    weighted, and along the axes `alone` of (z, y, x), each window has cells of its own. A window has `least` along each
-    axis, or its voxels.
-    """
-    starts, sizes, per_window, hops = [], [], [], []
-    for axis, (size, step, count) in enumerate(zip(layout.size, layout.step, layout.count, strict=True)):
-        shared = gcd(size, step)
-        if shared < SMALLEST_BLOCK or step >= size or layout.is_weighted or 2 - axis in alone:
-            length, stride, blocks, hop = size, step, count, 1
-        else:
-            length, stride, blocks, hop = shared, shared, ((count - 1) * step + size) // shared, step // shared
-        parts = min(length, -(-least * length // size))
-        edges = np.arange(parts + 1) * length // parts
-        starts.append((stride * np.arange(blocks)[:, np.newaxis] + edges[:-1]).ravel())
-        sizes.append(np.tile(np.diff(edges), blocks))
-        per_window.append(parts * (size // length))
-        hops.append(parts * hop)
-    (x, y, z), (width, height, depth) = starts, sizes
-    return Cells((z, y, x), (depth, height, width), triple(per_window[::-1]), triple(hops[::-1]))
 
 
 def margins(layout: WindowLayout, shape_zyx: Triple, radius: int) -> tuple[Triple, Triple]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from math import gcd
 from typing import Literal
 
 import numpy as np
@@ -247,6 +248,52 @@ def triple(values: Iterable[int]) -> Triple:
     """Return three numbers as a triple, which a tuple of any length is not for the type checker."""
     x, y, z = values
     return x, y, z
+
+
+# Blocks narrower than this cost more in sums of sums than the products they save.
+SMALLEST_BLOCK = 4
+# Cells along an axis of a window, at least, where it has as many voxels: groups enough for a variance.
+CELLS_PER_WINDOW = 4
+
+Starts = tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]
+
+
+@dataclass(frozen=True, eq=False)
+class Cells:
+    """How the windows of one layout are made of cells, along (z, y, x).
+
+    Cell k along an axis covers `size[k]` voxels from `start[k]` on, counted from the first window's first voxel; window
+    k is the sum of cells k hop ... k hop + per_window - 1.
+    """
+
+    start: Starts
+    size: Starts
+    per_window: Triple
+    hop: Triple
+
+
+def cells_of(layout: WindowLayout, least: int = CELLS_PER_WINDOW, alone: Sequence[int] = ()) -> Cells:
+    """Return the cells that make up the windows, axis by axis.
+
+    Windows share cells of their step's and size's common divisor, or parts of these; where it is small or windows are
+    weighted, and along the axes `alone` of (z, y, x), each window has cells of its own. A window has `least` along each
+    axis, or its voxels.
+    """
+    starts, sizes, per_window, hops = [], [], [], []
+    for axis, (size, step, count) in enumerate(zip(layout.size, layout.step, layout.count, strict=True)):
+        shared = gcd(size, step)
+        if shared < SMALLEST_BLOCK or step >= size or layout.is_weighted or 2 - axis in alone:
+            length, stride, blocks, hop = size, step, count, 1
+        else:
+            length, stride, blocks, hop = shared, shared, ((count - 1) * step + size) // shared, step // shared
+        parts = min(length, -(-least * length // size))
+        edges = np.arange(parts + 1) * length // parts
+        starts.append((stride * np.arange(blocks)[:, np.newaxis] + edges[:-1]).ravel())
+        sizes.append(np.tile(np.diff(edges), blocks))
+        per_window.append(parts * (size // length))
+        hops.append(parts * hop)
+    (x, y, z), (width, height, depth) = starts, sizes
+    return Cells((z, y, x), (depth, height, width), triple(per_window[::-1]), triple(hops[::-1]))
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,6 @@ Axes: points (n, 3) and displacements in mm, at the middle of each track.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -173,31 +172,20 @@ SMALLEST_SIGMA_SHARE = 1e-6
 SMALLEST_SPREAD = 1e-12
 
 
-@dataclass(frozen=True, eq=False)
-class LocalFits:
-    """Polynomials of one degree through the k nearest tracks of m places.
-
-    Attributes
-    ----------
-    value : (m, 3) at the places, mm
-    weights : (m, 3, k) what a stated standard error of each track adds to the value, mm
-    scatter2 : (m, 3) mean square of the tracks' residuals over that of their stated errors
-    radius_mm : (m,) distance of the furthest track
-    """
-
-    value: Floats
-    weights: Floats
-    scatter2: Floats
-    radius_mm: Floats
-
-
-def fit_around(offset_mm: Floats, values: Floats, sigma: Floats, degree: int) -> LocalFits:
-    """Fit polynomials of degree 1 or 2.
+def fit_around(offset_mm: Floats, values: Floats, sigma: Floats, degree: int) -> tuple[Floats, Floats, Floats, Floats]:
+    """Fit polynomials of degree 1 or 2 through the k nearest tracks of m places.
 
     Parameters
     ----------
     offset_mm : (m, k, 3) from a place to its tracks, nearest first
     values, sigma : (m, k, 3) their displacements and stated standard errors, mm
+
+    Returns
+    -------
+    value : (m, 3) at the places, mm
+    weights : (m, 3, k) what a stated standard error of each track adds to the value, mm
+    scatter2 : (m, 3) mean square of the tracks' residuals over that of their stated errors
+    radius_mm : (m,) distance of the furthest track
     """
     distance = np.linalg.norm(offset_mm, axis=2)
     radius = np.where(distance[:, -1:] > 0.0, distance[:, -1:], 1.0)
@@ -234,7 +222,7 @@ def fit_around(offset_mm: Floats, values: Floats, sigma: Floats, degree: int) ->
         scatter2.append(np.sum(kernel * robust * off**2, axis=1) / expected)
         weights.append((inverse[:, :1] @ weighted)[:, 0] * error)
         value.append(coefficients[:, 0, 0])
-    return LocalFits(np.stack(value, axis=1), np.stack(weights, axis=1), np.stack(scatter2, axis=1), radius[:, 0])
+    return np.stack(value, axis=1), np.stack(weights, axis=1), np.stack(scatter2, axis=1), radius[:, 0]
 
 
 def _equations(terms: Floats, weight: Floats) -> tuple[Floats, Floats]:
@@ -364,19 +352,20 @@ def _by_kriging(
 def _candidates(offset_mm: Floats, values: Floats, sigma: Floats, choices: list[tuple[int, int]]) -> Choices:
     """Return what the choices say at nodes whose nearest tracks (m, k, 3) are given."""
     fits = [fit_around(offset_mm[:, :k], values[:, :k], sigma[:, :k], degree) for degree, k in choices]
-    reference, of_differences = fits[REFERENCE], []
-    for fit in fits:
+    value, all_weights, scatter2, radius = zip(*fits, strict=True)
+    reference, of_differences = all_weights[REFERENCE], []
+    for weights in all_weights:
         # The two share their nearest tracks.
-        common = min(fit.weights.shape[2], reference.weights.shape[2])
-        difference = fit.weights[..., :common] - reference.weights[..., :common]
-        rest = [np.sum(each.weights[..., common:] ** 2, axis=2) for each in (fit, reference)]
+        common = min(weights.shape[2], reference.shape[2])
+        difference = weights[..., :common] - reference[..., :common]
+        rest = [np.sum(each[..., common:] ** 2, axis=2) for each in (weights, reference)]
         of_differences.append(np.sum(difference**2, axis=2) + rest[0] + rest[1])
     return Choices(
-        value=np.stack([fit.value for fit in fits]),
-        variance=np.stack([np.sum(fit.weights**2, axis=2) for fit in fits]),
+        value=np.stack(value),
+        variance=np.stack([np.sum(weights**2, axis=2) for weights in all_weights]),
         difference_variance=np.stack(of_differences),
-        radius_mm=np.stack([fit.radius_mm for fit in fits]),
-        scatter2=reference.scatter2,
+        radius_mm=np.stack(radius),
+        scatter2=scatter2[REFERENCE],
     )
 
 
