@@ -51,21 +51,15 @@ def validated(document: Document, source: str) -> Sections:
         sections = Sections.model_validate(document.data)
     except ValidationError as error:
         problems += [problem_of(document, details) for details in error.errors()]
-    for path, text in () if sections is None else _contradictions(sections):
-        problems.append(Problem(*place_of(document, path), key_name(path), text))
+    if sections is not None:
+        # Nothing can be calculated with numbers that are beyond all others.
+        found = list(_beyond_numbers(sections.model_dump(), ()))
+        for faults in () if found else FAULTS:
+            found += faults(sections)
+        problems += [Problem(*place_of(document, path), key_name(path), text) for path, text in found]
     if problems or sections is None:
         raise ConfigError(report(source, problems))
     return sections
-
-
-def _contradictions(sections: Sections) -> Found:
-    """Yield the place and the sentence of everything that cannot be."""
-    beyond = list(_beyond_numbers(sections.model_dump(), ()))
-    if beyond:
-        yield from beyond
-        return
-    for faults in (_lens, _lens_images, _volume, _board, _walls, _scene, _processing, _rays, _object_space):
-        yield from faults(sections)
 
 
 def _beyond_numbers(value: Any, path: KeyPath) -> Found:
@@ -337,3 +331,7 @@ def _object_space(sections: Sections) -> Found:
                 f"puts the window's far face at z = {written(-path, 4)} mm, inside the volume that begins at "
                 f"{written(nearest, 4)}",
             )
+
+
+# All that several keys can say together.
+FAULTS = (_lens, _lens_images, _volume, _board, _walls, _scene, _processing, _rays, _object_space)

@@ -51,11 +51,11 @@ class Format:
     in_folders: bool = True
 
 
-RAW = Format("raw", blocks.unstated_frames, suffixes=blocks.SUFFIXES, frames_of=blocks.frames_laid_out)
+RAW = Format("raw", blocks.frames, suffixes=blocks.SUFFIXES, frames_of=blocks.frames)
 FORMATS = (
     Format("TIFF", tiff.frames, starts=tiff.STARTS),
     Format("PNG", tiff.png_frames, starts=(tiff.PNG_START,)),
-    Format("HDF5", stack.frames, starts=(stack.START,), frames_of=stack.frames_named, in_folders=False),
+    Format("HDF5", stack.frames, starts=(stack.START,), frames_of=stack.frames, in_folders=False),
     Format("Phantom cine", cameras.cine_frames, starts=(cameras.CINE_START,)),
     Format("Norpix seq", cameras.seq_frames, starts=(cameras.SEQ_START,)),
     Format("Photron mraw", cameras.mraw_frames, suffixes=(cameras.MRAW_SUFFIX,), beside=cameras.header_beside),

@@ -156,7 +156,26 @@ def ensure_room(held_bytes: float, work: str, remedy: str = "a smaller volume, o
     work : what makes them
     remedy : what needs less
     """
-    for left, by in _rooms():
+    own, limit, machine = _told(PROCESS / "status"), address_space(), _told(MACHINE)
+    # What this process can still get by each limit that it has, in bytes, and what sets the limit.
+    rooms: list[tuple[float, str]] = []
+    if limit is not None:
+        rooms.append((max(limit - own.get("VmSize", 0), 0), "this process's address space (ulimit -v)"))
+    for line in _text(PROCESS / "cgroup").splitlines():
+        _, controllers, group = line.split(":", 2)
+        if controllers and "memory" not in controllers.split(","):
+            continue
+        # Both versions of control groups; a limit on a group holds for all groups in it.
+        base, name = CONTROL_GROUPS, "memory.max"
+        if controllers:
+            base, name = CONTROL_GROUPS / "memory", "memory.limit_in_bytes"
+        place = base / group.lstrip("/")
+        for folder in (place, *place.parents):
+            if (folder == base or base in folder.parents) and (text := _text(folder / name).strip()).isdecimal():
+                rooms.append((max(int(text) - own.get("VmRSS", 0), 0), "this job's limit (its control group)"))
+    if "MemAvailable" in machine:
+        rooms.append((machine["MemAvailable"] + machine.get("SwapFree", 0), "this machine"))
+    for left, by in rooms:
         if held_bytes > left:
             raise OutputError(
                 f"too little memory: {work} needs {_gb(PROGRAM_BYTES + held_bytes)} GB, {_gb(held_bytes)} of them for "
@@ -169,29 +188,6 @@ def ensure_disk(file_bytes: float, target: Path) -> None:
     left = shutil.disk_usage(target.parent).free
     if file_bytes > left:
         raise OutputError(f"{target}: needs {_gb(file_bytes)} GB, and {_gb(left)} GB are free on the disk")
-
-
-def _rooms() -> Iterator[tuple[float, str]]:
-    """Yield what this process can still get by each limit that it has, in bytes, and what sets the limit."""
-    own = _told(PROCESS / "status")
-    limit = address_space()
-    if limit is not None:
-        yield max(limit - own.get("VmSize", 0), 0), "this process's address space (ulimit -v)"
-    for line in _text(PROCESS / "cgroup").splitlines():
-        _, controllers, group = line.split(":", 2)
-        if controllers and "memory" not in controllers.split(","):
-            continue
-        # Both versions of control groups; a limit on a group holds for all groups in it.
-        base, name = CONTROL_GROUPS, "memory.max"
-        if controllers:
-            base, name = CONTROL_GROUPS / "memory", "memory.limit_in_bytes"
-        place = base / group.lstrip("/")
-        for folder in (place, *place.parents):
-            if (folder == base or base in folder.parents) and (text := _text(folder / name).strip()).isdecimal():
-                yield max(int(text) - own.get("VmRSS", 0), 0), "this job's limit (its control group)"
-    machine = _told(MACHINE)
-    if "MemAvailable" in machine:
-        yield machine["MemAvailable"] + machine.get("SwapFree", 0), "this machine"
 
 
 def _told(path: Path) -> dict[str, int]:

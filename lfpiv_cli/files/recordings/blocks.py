@@ -228,19 +228,16 @@ OPTIONS: Mapping[str, tuple[Callable[[str], Any], Callable[[Any], bool], str]] =
 HINT = "a layout is WIDTHxHEIGHTxBITS and options, as in 2352x1768x12:packing=low-first:header=512"
 
 
-def unstated_frames(path: Path) -> Recording:
-    """Refuse frames whose layout is not stated."""
-    raise UsageError(f"{path}: has no header: state its layout with --raw, or as {path}:LAYOUT; {HINT}")
-
-
-def frames_laid_out(path: Path, layout: str) -> Recording:
+def frames(path: Path, layout: str | None = None) -> Recording:
     """Return the frames of a file, as many as a stated layout finds in it.
 
     Raises
     ------
-    UsageError : the layout is not one
+    UsageError : no layout is stated, or it is not one
     InputError : the file does not end with a frame
     """
+    if layout is None:
+        raise UsageError(f"{path}: has no header: state its layout with --raw, or as {path}:LAYOUT; {HINT}")
     pixels, options = parse_layout(layout)
     header, gap = options.get("header", 0), options.get("gap", 0)
     held, step = path.stat().st_size - header, pixels.frame_bytes + gap

@@ -26,14 +26,16 @@ MOST_CHUNK_BYTES = 2**28
 MOST_LISTED = 5
 
 
-def frames(path: Path) -> Recording:
-    """Return the frames of the only dataset of three dimensions.
+def frames(path: Path, name: str | None = None) -> Recording:
+    """Return the frames of a dataset, of one with two dimensions the only frame; by default of the only one of three.
 
     Raises
     ------
-    InputError : there is none, there are several, or it is a file of ours
+    InputError : there is no such dataset, there are several, or it is a file of ours
     """
     with open_h5(path) as file:
+        if name is not None:
+            return _frames_in(path, _dataset(path, file, name))
         if "format" in file.attrs and "provenance" in file.attrs:
             raise InputError(f"{path}: is a result of this program, expected images")
         names = [dataset.name for dataset in _datasets(file, DEEPEST, set()) if dataset.ndim == 3]
@@ -44,12 +46,6 @@ def frames(path: Path) -> Recording:
                 + (f": {listed}" if names else "")
             )
         return _frames_in(path, file[names[0]])
-
-
-def frames_named(path: Path, name: str) -> Recording:
-    """Return the frames of a dataset: of one with two dimensions, the only frame."""
-    with open_h5(path) as file:
-        return _frames_in(path, _dataset(path, file, name))
 
 
 def _datasets(group: h5py.Group, levels: int, seen: set[int]) -> Iterator[h5py.Dataset]:
