@@ -165,7 +165,7 @@ class DotLook(Look):
 
 
 def disc_shape(radius_mm: float) -> PointShape:
-    """Return a dot."""
+    """Return the shape of a round dot."""
     return PointShape(radius_mm, radius_mm, covered_shares, radius_mm, partial(disc_strips, radius_mm))
 
 
