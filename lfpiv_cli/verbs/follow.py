@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -37,20 +37,14 @@ from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, Points, no_points, r
 from lfpiv_cli.files.provenance import record, sha256, with_warnings
 from lfpiv_cli.files.shares import Deadline
 from lfpiv_cli.notice import Notice
+from lfpiv_cli.particles.neighbour_frames import STEPS as PREDICTED_STEPS
 from lfpiv_cli.reconstruction.images import Image
 from lfpiv_cli.reference import Reference
 from lfpiv_cli.tracks.candidates import Trajectories
 from lfpiv_cli.verbs import particles
 from lfpiv_cli.verbs.batches import ALL, Batch, Failure, Worked, WorkOptions, dry_run
 from lfpiv_cli.verbs.checks import few_notices
-from lfpiv_cli.verbs.following import (
-    SHORTEST,
-    Recorded,
-    ensure_sequence,
-    forwards,
-    go_both_ways,
-    steps_of,
-)
+from lfpiv_cli.verbs.following import SHORTEST, Recorded, ensure_sequence, forwards, go_both_ways
 from lfpiv_cli.verbs.frames import (
     STILL,
     Background,
@@ -59,10 +53,10 @@ from lfpiv_cli.verbs.frames import (
     frame_notices,
     frames_dt_notices,
     mask_of,
+    other_frames,
     read_frame,
     reader,
     residual_path,
-    sequence_digests,
 )
 from lfpiv_cli.verbs.particles import open_weights_that_fit, searchable_weights
 from lfpiv_cli.verbs.reconstruct import file_notices
@@ -70,52 +64,47 @@ from lfpiv_cli.verbs.tracers import size_notices
 from lfpiv_cli.verbs.track import SeenFrames, stored_tracks
 from lfpiv_cli.verbs.tracks import Tracking, tracking_of
 
-# The files of a sequence's frames, as they are followed: one for each, written as it is found.
 
-
+@dataclass(eq=False)
 class PlannedFrames(Batch[None]):
     """The frames of a sequence that can be read before any is followed, as `dry_run` asks of them."""
 
-    label, unit = "follow", "frame"
-
-    def __init__(
-        self,
-        targets: Sequence[Target],
-        beside: Sequence[Path],
-        inputs: Sequence[Path],
-        left_out: Sequence[Failure],
-        overwrite: bool,
-    ) -> None:
-        """Take where particles and the other files go, what is read, and which frames cannot be."""
-        self.targets, self.beside, self.inputs = targets, beside, inputs
-        self.left_out, self.overwrite = left_out, overwrite
+    targets: Sequence[Target]
+    beside: Sequence[Path]
+    inputs: Sequence[Path]
+    left_out: Sequence[Failure]
+    overwrite: bool
+    label = "follow"
+    unit = "frame"
 
 
+@dataclass(eq=False)
 class FrameFiles:
-    """A store of one file for each frame."""
+    """A store of one file for each frame, written as it is found.
 
-    def __init__(
-        self,
-        targets: Sequence[Target],
-        needed: frozenset[int],
-        there: frozenset[int],
-        reference: Reference,
-        said: Sequence[Notice],
-        residuals: bool,
-        overwrite: bool,
-        work: Frames,
-        deadline: Deadline,
-    ) -> None:
-        """Take where the frames' files go, which are to be made, which there are, and what is said of all of them."""
-        self._deadline, self._begun, self._put = deadline, time.monotonic(), 0
-        self.targets, self.needed, self.there, self.said = targets, needed, there, said
-        self._nothing = no_points(PARTICLES_FORMAT, reference)
-        self.residuals, self.overwrite, self.work = residuals, overwrite, work
+    Attributes
+    ----------
+    targets : where the frames' files go
+    needed, there : the numbers of those that are to be made, and of all that there are
+    said : what is said of all of them
+    """
+
+    targets: Sequence[Target]
+    needed: Collection[int]
+    there: Collection[int]
+    reference: Reference
+    said: Sequence[Notice]
+    residuals: bool
+    overwrite: bool
+    work: Frames
+    deadline: Deadline
+    put_so_far: int = 0
+    begun_s: float = 0.0
 
     def read(self, number: int) -> Points:
         """Return the particles of a frame; none of one that was left out."""
         if number not in self.there:
-            return self._nothing
+            return no_points(PARTICLES_FORMAT, self.reference)
         return read_points(self.targets[number].path, PARTICLES_FORMAT)
 
     def made(self, number: int) -> Points | None:
@@ -127,10 +116,10 @@ class FrameFiles:
         """
         if number not in self.needed:
             return self.read(number)
-        if not self._deadline.leaves_time():
-            done = len(self.there) - len(self.needed) + self._put
-            raise self._deadline.error(done, len(self.there), "frame")
-        self._begun = time.monotonic()
+        if not self.deadline.leaves_time():
+            done = len(self.there) - len(self.needed) + self.put_so_far
+            raise self.deadline.error(done, len(self.there), "frame")
+        self.begun_s = time.monotonic()
         return None
 
     def put(self, number: int, points: Points, left: Image, notices: list[Notice]) -> None:
@@ -141,8 +130,8 @@ class FrameFiles:
             image_files.write_tiff(residual_path(target.path), left, overwrite=True)
         told = replace(points, provenance=with_warnings(target.record, [*self.said, *notices]))
         write_points(target.path, PARTICLES_FORMAT, told, overwrite=self.overwrite)
-        self._deadline.took(time.monotonic() - self._begun)
-        self._put += 1
+        self.deadline.took(time.monotonic() - self.begun_s)
+        self.put_so_far += 1
         self.work.done(target.path.stem)
 
 
@@ -220,8 +209,8 @@ def follow_particles(
         frames, left_out = _readable(frames, shape)
         console.warn(Notice("frame-failed", each.name, each.error, "leave it out, or mend it") for each in left_out)
         ensure_sequence(len(frames), options.shortest)
-    told = sequence_digests(level, frames, options.mask)
-    passes = _passes(output, frames, told, settings, tracking, common, options.both_ways)
+    words = other_frames(level, frames, options.mask)
+    passes = _passes(output, frames, words, settings, tracking, common, options.both_ways)
     inputs = [*common.values(), *images]
     if options.dry_run:
         beside = [output / TRACKS, output / PLAYBACK, *(target.path for targets in passes[:-1] for target in targets)]
@@ -249,12 +238,14 @@ def follow_particles(
     sequence = Recorded(bench, size, tracking, frame_at, [frame.stem for frame in frames], {})
     found: Trajectories | None
     count, deadline = sum(map(len, needed)), options.deadline()
-    with console.frames(count, steps_of(needed) / max(count, 1), "follow") as work:
+    searched = sum(number < 2 for number in needed[0])
+    steps = searched * particles.STEPS + (count - searched) * PREDICTED_STEPS
+    with console.frames(count, steps / max(count, 1), "follow") as work:
         stores = [
             FrameFiles(
                 targets,
-                frozenset(numbers),
-                frozenset(there),
+                set(numbers),
+                set(there),
                 content.reference,
                 said,
                 options.residuals and targets is passes[-1],
@@ -335,7 +326,7 @@ def _write_tracks(
 def _passes(
     output: Path,
     frames: Sequence[Frame],
-    told: Sequence[str],
+    words: Callable[[int], str],
     settings: Config,
     tracking: Tracking,
     common: Mapping[str, Path],
@@ -344,7 +335,7 @@ def _passes(
     """Return for each pass where the files of its frames go, and the records that they carry.
 
     These say which frames each is made with: on the way forwards those before it (the first with the second), the
-    second time all; `told` says what their background and mask are made of.
+    second time all; `words` says what their background and mask are made of.
     """
     every = ["left out\n" if frame.fault else f"{sha256(frame.path)} {frame.page}\n" for frame in frames]
     resolved = settings.resolved()
@@ -355,7 +346,7 @@ def _passes(
             f"follow {way} page {frame.page} of {count} frames, SHA-256 {digest}, within {tracking.search_mm:g} mm"
         )
         inputs, taken_s = {**common, "image": frame.path}, {"image": frame.time_s}
-        return Target(path, partial(record, command + told[number], resolved, inputs, taken_s))
+        return Target(path, partial(record, command + words(number), resolved, inputs, taken_s))
 
     stems, numbers = [frame.stem for frame in frames], range(len(frames))
     folder = output / (FORWARDS if both_ways else PARTICLES)

@@ -207,12 +207,6 @@ def other_frames(level: Background, frames: Sequence[Frame], mask: str | Path | 
     return words
 
 
-def sequence_digests(level: Background, frames: Sequence[Frame], mask: str | Path | None = None) -> list[str]:
-    """Return for each frame which other frames its background and mask are made from, as words for its record."""
-    words = other_frames(level, frames, mask)
-    return [words(number) for number in range(len(frames))]
-
-
 def beside_frames(
     words: Callable[[int], str], frames: Sequence[Frame], beside: Sequence[tuple[int, ...]]
 ) -> Callable[[int], str]:
