@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
+from dataclasses import fields as fields_of
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -40,7 +41,6 @@ from lfpiv_cli.flow.windows import inside
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.notice import Notice, warn_of
 from lfpiv_cli.reference import FOCAL_POINT, Reference
-from lfpiv_cli.scale import Scale
 from lfpiv_cli.verbs.batches import ALL, BatchOptions, Expected, Worked, dry_run, work_through
 from lfpiv_cli.verbs.checks import (
     Quality,
@@ -93,7 +93,21 @@ def correlate(
     UsageError
         Plain arrays are given without `voxel_mm`.
     """
-    first, second = (_as_volume(each, voxel_mm) for each in (a, b))
+    volumes: list[Volume] = []
+    for each in (a, b):
+        if isinstance(each, Volume):
+            volumes.append(each)
+            continue
+        if voxel_mm is None:
+            raise UsageError("correlate: plain arrays need voxel_mm, the size of a voxel along x, y, z")
+        array = np.asarray(each, dtype=np.float32)
+        if array.ndim != 3:
+            raise InputError(f"a volume of shape {array.shape}, expected (nz, ny, nx)")
+        nz, ny, nx = array.shape
+        # About the origin.
+        grid = Grid.centred((nx, ny, nz), voxel_mm, (0.0, 0.0, 0.0))
+        volumes.append(Volume(array, grid, FOCAL_POINT, {}, {}))
+    first, second = volumes
     ensure_alike(first, second, ("the first volume", "the second volume"))
     config = first.provenance.get("config")
     carried = carried_config(first.provenance, "the volume") if config else Config.from_resolved({})
@@ -103,16 +117,11 @@ def correlate(
     field = correlation.correlate([(first.array, second.array)], first.grid, windows, mask=usable)
     if config:
         # Of light that no camera recorded nothing is known.
-        field = with_locking(field, first.reference, scale_of(chosen))
+        field = with_locking(field, first.reference, chosen.camera_model().scale(chosen.media_model()))
     quality, name = quality_of(field), "the field"
     against_field = [*field_notices(quality, name), *pair_notices(field, quality, name)]
     warn_of([*window_notices(first, windows, "the first volume"), *against_field])
     return field
-
-
-def scale_of(settings: Config) -> Scale:
-    """Return the lengths in the scene of the camera that volumes were made of."""
-    return settings.camera_model().scale(settings.media_model())
 
 
 def usable_voxels(settings: Config, grid: Grid, mask: NDArray[Any] | None) -> NDArray[np.bool_] | None:
@@ -137,19 +146,6 @@ def ensure_alike(first: Volume, second: Volume, names: tuple[str, str]) -> None:
     if first.reference.name != second.reference.name:
         raise InputError(f"{names[1]}: its coordinates have another origin than those of {names[0]}")
     ensure_agreement([first.provenance, second.provenance], names, OF_FRAMES)
-
-
-def _as_volume(volume: Volume | NDArray[Any], voxel_mm: tuple[float, float, float] | None) -> Volume:
-    """Return a volume as such, a plain array about the origin."""
-    if isinstance(volume, Volume):
-        return volume
-    if voxel_mm is None:
-        raise UsageError("correlate: plain arrays need voxel_mm, the size of a voxel along x, y, z")
-    array = np.asarray(volume, dtype=np.float32)
-    if array.ndim != 3:
-        raise InputError(f"a volume of shape {array.shape}, expected (nz, ny, nx)")
-    nz, ny, nx = array.shape
-    return Volume(array, Grid.centred((nx, ny, nz), voxel_mm, (0.0, 0.0, 0.0)), FOCAL_POINT, {}, {})
 
 
 # Numbers of eight bytes that a file has of each vector at most, and derived ones besides.
@@ -217,7 +213,12 @@ def correlate_files(
     Of vectors and tracks that are there, in place of volumes, only the `mean` is made.
     """
     if options.mean is not None and not options.watch and are_measured(volumes):
-        _ensure_for_mean(options, volumes[0])
+        for each in fields_of(options):
+            if each.compare and each.name not in FOR_MEANS and getattr(options, each.name) != each.default:
+                name = each.name.removesuffix("_volume").replace("_", "-")
+                raise UsageError(
+                    f"--{name}: is for volumes; the mean of {volumes[0]} and those beside it has no use for it"
+                )
         if output is not None:
             console.say(f"{output}: is not written: the vectors are there, and --mean alone is made of them")
         return mean_of_measured(volumes, options.mean, options, options.derived, overwrite, console)
@@ -236,19 +237,6 @@ def correlate_files(
         # What another worker made of the same fields in the meantime is as good.
         work_through(mean, BatchOptions(resume=True), console)
     return worked.ensure_whole(batch.summary(worked), batch.unit)
-
-
-def _ensure_for_mean(options: CorrelateOptions, first: Path) -> None:
-    """Refuse options that the mean of vectors that are there has no use for.
-
-    Raises
-    ------
-    UsageError
-    """
-    for each in fields(options):
-        if each.compare and each.name not in FOR_MEANS and getattr(options, each.name) != each.default:
-            name = each.name.removesuffix("_volume").replace("_", "-")
-            raise UsageError(f"--{name}: is for volumes; the mean of {first} and those beside it has no use for it")
 
 
 def _as_they_come(
@@ -308,7 +296,21 @@ class Correlation(PairBatch[Outcome, CorrelateOptions]):
         paths = output_paths(output, [group[0][0].stem for group in self._groups])
         self.targets = [Target(path, partial(self._record, number)) for number, path in enumerate(paths)]
         self.beside = [options.mean] if options.mean else []
-        self._first = files[0] if self._gone else _ensure_readable(files, options.keep_going)
+        # The first volume that can be opened, after it is known whether the others can, where one is to stop.
+        readable: list[Path] = []
+        fault: InputError | None = None
+        for path in () if self._gone else files:
+            try:
+                ensure_opens(path)
+            except InputError as error:
+                if not options.keep_going:
+                    raise
+                fault = fault or error
+            else:
+                readable.append(path)
+        if fault is not None and not readable:
+            raise fault
+        self._first = (readable or files)[0]
 
     def fault(self, number: int) -> str | None:
         """Return why a volume of a field cannot be opened."""
@@ -325,15 +327,12 @@ class Correlation(PairBatch[Outcome, CorrelateOptions]):
         if self._options.mean is not None:
             ensure_writable(self._options.mean, self.overwrite or self._options.resume)
         if numbers and not self._gone:
-            ensure_room(self._held(), self.label)
+            try:
+                held = self.expected().memory_bytes or 0.0
+            except LfpivError:
+                held = 0.0  # its volume cannot be read, which is told in its turn
+            ensure_room(held, self.label)
         return 1.0
-
-    def _held(self) -> float:
-        """Return what a field takes in memory; 0 where its volume cannot be read, which is told in its turn."""
-        try:
-            return self.expected().memory_bytes or 0.0
-        except LfpivError:
-            return 0.0
 
     def make(self, number: int, work: Frames) -> Outcome:
         """Correlate a pair, or all of them, and write the vectors."""
@@ -377,19 +376,13 @@ class Correlation(PairBatch[Outcome, CorrelateOptions]):
         group = self._groups[number]
         settings = self._settings_of(group[0][0])
         if settings.correlation.dt_s is None:
-            settings = settings.overridden("correlation", dt_s=self._step_s(group))
+            # Where the recordings of the frames of all pairs tell it: the same in all of them.
+            steps = [seconds_between(self._record_of(first), self._record_of(second)) for first, second in group]
+            told = [step for step in steps if step is not None]
+            names = [str(group[0][0]), str(group[-1][1])]
+            step_s = ensure_even(told, names) if told and len(told) == len(steps) else None
+            settings = settings.overridden("correlation", dt_s=step_s)
         return Job(group, settings)
-
-    def _step_s(self, group: Sequence[tuple[Path, Path]]) -> float | None:
-        """Return the time within the pairs of a field, where the recordings of their frames tell it.
-
-        Raises
-        ------
-        InputError : it is not the same in all of them
-        """
-        steps = [seconds_between(self._record_of(first), self._record_of(second)) for first, second in group]
-        told = [step for step in steps if step is not None]
-        return ensure_even(told, [str(group[0][0]), str(group[-1][1])]) if told and len(told) == len(steps) else None
 
     def _record_of(self, volume: Path) -> Mapping[str, Any]:
         """Return the record of a volume, which may be gone."""
@@ -447,27 +440,5 @@ def _measure(job: Job, mask: Path | None, work: Frames) -> tuple[VectorField, Re
     notices = [*calibration_notices(records), *window_notices(first, settings, job.pairs[0][0].name)]
     share = 1.0 / count_passes(settings.windows)
     field = measure(volumes(), first.grid, settings, mask=usable, progress=lambda passes: work.advance(share * passes))
-    field = with_locking(field, first.reference, scale_of(job.settings))
+    field = with_locking(field, first.reference, job.settings.camera_model().scale(job.settings.media_model()))
     return field, first.reference, notices
-
-
-def _ensure_readable(volumes: Sequence[Path], keep_going: bool) -> Path:
-    """Return the first volume that can be opened, after it is known whether the others can, where one is to stop.
-
-    Raises
-    ------
-    InputError : one cannot, or with `keep_going` none
-    """
-    readable, first_fault = [], None
-    for path in volumes:
-        try:
-            ensure_opens(path)
-        except InputError as error:
-            if not keep_going:
-                raise
-            first_fault = first_fault or error
-        else:
-            readable.append(path)
-    if not readable and first_fault is not None:
-        raise first_fault
-    return readable[0]

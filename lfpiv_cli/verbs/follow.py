@@ -31,7 +31,6 @@ from lfpiv_cli.files.batch import (
 )
 from lfpiv_cli.files.config import Config, carried_config
 from lfpiv_cli.files.exports.vtk import write_playback
-from lfpiv_cli.files.inputs import given
 from lfpiv_cli.files.pairing import in_order
 from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, Points, no_points, read_points, write_points
 from lfpiv_cli.files.provenance import record, sha256, with_warnings
@@ -46,8 +45,7 @@ from lfpiv_cli.verbs.batches import ALL, Batch, Failure, Worked, WorkOptions, dr
 from lfpiv_cli.verbs.checks import few_notices
 from lfpiv_cli.verbs.following import SHORTEST, Recorded, ensure_sequence, forwards, go_both_ways
 from lfpiv_cli.verbs.frames import (
-    STILL,
-    Background,
+    ImageOptions,
     bench_of,
     check_frame,
     frame_notices,
@@ -141,12 +139,11 @@ TRACKS, PLAYBACK = f"tracks{VTKHDF_SUFFIX}", f"playback{VTKHDF_SUFFIX}"
 
 
 @dataclass(frozen=True, kw_only=True)
-class FollowOptions(WorkOptions):
+class FollowOptions(ImageOptions, WorkOptions):
     """What `follow_particles` is given besides weights and images; with `keep_going` tracks end before bad frames.
 
     Attributes
     ----------
-    dark, background, mask : as of `reconstruct`
     dt_s : time from one frame to the next, in place of the config's
     search_voxel : displacements from the first frame to the second are sought up to this along each axis
     shortest : fewest frames of a track
@@ -154,9 +151,6 @@ class FollowOptions(WorkOptions):
     residuals : write what the particles leave of each image, too
     """
 
-    dark: Path | None = None
-    background: str | None = None
-    mask: str | Path | None = None
     dt_s: float | None = None
     search_voxel: float | None = None
     shortest: int = SHORTEST
@@ -193,9 +187,7 @@ def follow_particles(
     order, notices = in_order(images_seen(frames))
     frames = [frames[number] for number in order]
     console.warn(notices)
-    level = Background.parse(options.background)
-    mask_file = None if options.mask is None or options.mask == STILL else Path(options.mask)
-    common = given(weights=weights, dark=options.dark, background=level.path, mask=mask_file)
+    level, common = options.level, options.files(weights)
     content = open_weights_that_fit(weights)
     settings = carried_config(content.provenance, weights).overridden("reconstruction", solver="particles")
     settings = settings.overridden("correlation", dt_s=options.dt_s)
@@ -221,7 +213,7 @@ def follow_particles(
     needed = [_needed(targets, there, inputs, options, overwrite, targets is passes[-1]) for targets in passes]
     for name in (TRACKS, PLAYBACK):
         ensure_writable(output / name, overwrite or options.resume, inputs)
-    dark = image_files.read_reference(options.dark, shape) if options.dark else None
+    dark = options.dark_image(shape)
     pitch_px = float(content.camera.micro_image_lattice_px().pitch.max())
     bench = bench_of(content, settings, dark, mask_of(options.mask, frames, shape, pitch_px, options.keep_going))
     read = reader(level, frames, shape, dark, options.keep_going)

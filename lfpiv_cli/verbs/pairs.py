@@ -9,14 +9,13 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Any, Generic, TypeVar
 
 from lfpiv_cli.console import Console, Frames
 from lfpiv_cli.errors import InputError, UsageError
 from lfpiv_cli.files import images as image_files
 from lfpiv_cli.files import vtkhdf
 from lfpiv_cli.files.batch import Frame, State, Target, images_seen, pending, results_seen, state_or_none
-from lfpiv_cli.files.config import Config
 from lfpiv_cli.files.listing import as_they_come, files_in
 from lfpiv_cli.files.pairing import Pairs, Seen, contradiction, in_order, pair_frames, pairs_listed
 from lfpiv_cli.files.provenance import Gone, carried_record, sha256, without_warnings
@@ -35,7 +34,7 @@ from lfpiv_cli.verbs.batches import (
     stamp_of,
     work_through,
 )
-from lfpiv_cli.verbs.frames import STILL, Background, residual_path
+from lfpiv_cli.verbs.frames import residual_path
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -171,12 +170,7 @@ def _doubts(frames: Sequence[Seen]) -> list[Notice]:
 OfBatch = TypeVar("OfBatch", bound=Batch)
 
 
-def watched(
-    folders: Sequence[Path],
-    kind: InputKind,
-    options: BatchOptions,
-    console: Console,
-) -> Iterator[list[Path]]:
+def watched(folders: Sequence[Path], kind: InputKind, options: BatchOptions, console: Console) -> Iterator[list[Path]]:
     """Yield the files of folders in groups, as they become complete: see `as_they_come`.
 
     Raises
@@ -192,7 +186,14 @@ def watched(
     for folder in folders:
         if not os.path.isdir(folder):
             raise UsageError(f"{folder}: --watch takes folders")
-    read = _read_image if kind == "images" else vtkhdf.read_header
+
+    def read(path: Path) -> None:
+        if kind == "images":
+            # The others are there when the last one is.
+            image_files.read_page(path, image_files.count_pages(path) - 1)
+        else:
+            vtkhdf.read_header(path)
+
     deadline, count = options.deadline(), 0
     console.say(f"watches {', '.join(map(str, folders))}; ends {options.idle_s:g} s after the last change")
 
@@ -206,24 +207,6 @@ def watched(
         yield group
     if count == 0:
         raise InputError(f"{folders[0]}: no {kind} have come in {options.idle_s:g} s")
-
-
-def ensure_frames_alone(settings: Config, background: str | None, mask: str | Path | None) -> None:
-    """Refuse what is made from other frames than a frame's own, where these are still coming.
-
-    Raises
-    ------
-    UsageError
-    """
-    if Background.parse(background).kind is not None:
-        refused = f"--background {background} is"
-    elif mask == STILL:
-        refused = f"--mask {STILL} is"
-    elif settings.reconstruction.solver == "particles":
-        refused = "the tracers' size, which --solver particles needs, is"
-    else:
-        return
-    raise UsageError(f"--watch: {refused} made from all frames, some of which have not come yet; wait for them")
 
 
 def work_as_they_come(
@@ -290,28 +273,15 @@ class ComingPairs:
             fresh = [pair for pair in found.pairs if pair not in self._made]
             self._made.update(fresh)
             self.left_out = failures_of(found)
-            self._tell(found)
+            # Once: what is taken for granted, and files that have no partner though later pairs are complete.
+            last = max((second for _, second in self._made), default=0)
+            before = {str(path) for path in self._seen[:last]}
+            passed = Pairs((), tuple(each for each in found.left_out if each.name in before), found.notices)
+            unsaid = [notice for notice in passed.said() if notice not in self._told]
+            self._told.update(unsaid)
+            self._console.warn(unsaid)
             if fresh:
                 yield [self._seen[number] for pair in fresh for number in pair]
-
-    def _tell(self, found: Pairs) -> None:
-        """Say once what is taken for granted, and which files have no partner though later pairs are complete."""
-        last = max((second for _, second in self._made), default=0)
-        before = {str(path) for path in self._seen[:last]}
-        passed = Pairs((), tuple(each for each in found.left_out if each.name in before), found.notices)
-        fresh = [notice for notice in passed.said() if notice not in self._told]
-        self._told.update(fresh)
-        self._console.warn(fresh)
-
-
-def _read_image(path: Path) -> None:
-    """Read the last frame of an image file: the others are there when it is.
-
-    Raises
-    ------
-    InputError : it cannot be read yet
-    """
-    image_files.read_page(path, image_files.count_pages(path) - 1)
 
 
 # Pairs whose volumes or particles are dropped as soon as their vectors stand.
@@ -322,13 +292,6 @@ def _read_image(path: Path) -> None:
 # last of its pairs.
 
 
-class Join(Protocol[Made]):
-    """Makes the batch of one pair: of the files of its frames, of which some may be gone, into one file."""
-
-    def __call__(self, pair: Sequence[Path], output: Path, gone: Mapping[Path, Gone]) -> Batch[Made]:
-        """Return it."""
-
-
 class PairByPair(Batch[Made]):
     """The batch of pairs, each from its two images to its vectors."""
 
@@ -337,13 +300,17 @@ class PairByPair(Batch[Made]):
     def __init__(
         self,
         found: Batch[Any],
-        join: Join[Made],
+        of_pair: Callable[..., Batch[Made]],
+        given: Sequence[Any],
         pairs: Pairs,
         targets: Sequence[Target],
         file_bytes: float | None = None,
     ) -> None:
-        """Take the batch of the frames, what joins two of them, where its results go, and how large one is if known."""
-        self._found, self._join, self._pairs = found, join, pairs.pairs
+        """Take the batch of the frames, the class of that of two of them and what it takes besides the files.
+
+        And where results go, and how large one is if that is known.
+        """
+        self._found, self._of_pair, self._given, self._pairs = found, of_pair, given, pairs.pairs
         self._file_bytes = file_bytes
         self.label, self.overwrite = found.label, found.overwrite
         self.targets = [replace(each, make_record=partial(self._record, k)) for k, each in enumerate(targets)]
@@ -361,39 +328,30 @@ class PairByPair(Batch[Made]):
     def begin(self, numbers: Sequence[int], console: Console) -> float:
         """Prepare the frames of the pairs that are to be made; drop those that no pair needs."""
         every = list(dict.fromkeys(k for number in numbers for k in self._pairs[number]))
-        left = self._left_of(every) if every else []
+        frames = [self._found.targets[k] for k in every]
+        left = [every[k] for k in pending(frames, self.inputs, self.overwrite, resume=True)] if every else []
         self._whole = {k: stamp_of(self._found.targets[k].path) for k in set(every) - set(left)}
         steps = self._found.begin(left, console)
         self._drop(range(len(self._found.targets)))
         # Where all frames are there, what joins them is a step.
         return max(steps * len(left) / max(len(numbers), 1), 1.0)
 
-    def _left_of(self, every: Sequence[int]) -> list[int]:
-        """Return the frames that have to be made."""
-        frames = [self._found.targets[k] for k in every]
-        return [every[k] for k in pending(frames, self.inputs, self.overwrite, resume=True)]
-
     def make(self, number: int, work: Frames) -> Made:
         """Make the files of two frames, where they are not there, and of these the result."""
         for k in self._pairs[number]:
-            self._ensure_made(k, work)
-        joined = self._joined(number, {})
+            target = self._found.targets[k]
+            stamp = stamp_of(target.path)
+            if stamp is None or self._whole.get(k) != stamp:
+                with awaited(target.path):
+                    if state_or_none(target) is not State.COMPLETE:
+                        self._found.make(k, work)
+                self._whole[k] = stamp_of(target.path)
+        joined = self._join(number, {})
         joined.begin([0], work.console)
         made = joined.make(0, work)
         self._complete.add(number)
         self._drop(self._pairs[number])
         return made
-
-    def _ensure_made(self, k: int, work: Frames) -> None:
-        """Make the file of a frame, unless it is there and complete, or another worker makes it."""
-        target = self._found.targets[k]
-        stamp = stamp_of(target.path)
-        if stamp is not None and self._whole.get(k) == stamp:
-            return
-        with awaited(target.path):
-            if state_or_none(target) is not State.COMPLETE:
-                self._found.make(k, work)
-        self._whole[k] = stamp_of(target.path)
 
     def _is_complete(self, number: int) -> bool:
         """Return whether the result of a pair is there, by whichever worker."""
@@ -421,39 +379,28 @@ class PairByPair(Batch[Made]):
         """Return how large a result is, and what is held while the files of a frame are made."""
         return Expected(self._file_bytes, self._found.expected().memory_bytes)
 
-    def _joined(self, number: int, gone: Mapping[Path, Gone]) -> Batch[Made]:
-        paths = [self._found.targets[k].path for k in self._pairs[number]]
-        return self._join(paths, self.targets[number].path, gone)
-
     def _record(self, number: int) -> Mapping[str, Any]:
-        """Return the record of a result, of its frames' files as they will be."""
-        targets = [self._found.targets[k] for k in self._pairs[number]]
-        to_come = {target.path: self._to_come(target, self.targets[number].path) for target in targets}
-        gone = {path: file for path, file in to_come.items() if file is not None}
-        return self._joined(number, gone).targets[0].record
+        """Return the record of a result, of its frames' files as they will be.
 
-    def _to_come(self, frame: Target, result: Path) -> Gone | None:
-        """Return a frame's file where it is gone, with the hash that the result carries, or is to carry another record.
-
-        None where it is there and stays as it is.
+        Of a file that is gone the hash is the one that the result carries; one that is there and stays as it is tells
+        of itself.
         """
-        carried: Mapping[str, Any]
-        if frame.path.exists():
-            carried, digest = carried_record(frame.path), sha256(frame.path)
-            if without_warnings(carried) == frame.record:
-                return None
-        else:
-            made = carried_record(result)
-            digest = {each["name"]: each["sha256"] for each in made["inputs"].values()}.get(frame.path.name, "")
-            carried = made["made_from"].get(digest, {})
-        return Gone(digest, {**frame.record, **{name: carried[name] for name in ("warnings",) if name in carried}})
+        gone: dict[Path, Gone] = {}
+        for frame in (self._found.targets[k] for k in self._pairs[number]):
+            carried: Mapping[str, Any]
+            if frame.path.exists():
+                carried, digest = carried_record(frame.path), sha256(frame.path)
+                if without_warnings(carried) == frame.record:
+                    continue
+            else:
+                made = carried_record(self.targets[number].path)
+                digest = {each["name"]: each["sha256"] for each in made["inputs"].values()}.get(frame.path.name, "")
+                carried = made["made_from"].get(digest, {})
+            warned = {name: carried[name] for name in ("warnings",) if name in carried}
+            gone[frame.path] = Gone(digest, {**frame.record, **warned})
+        return self._join(number, gone).targets[0].record
 
-
-def joined_by(make: Callable[..., Batch[Made]], *options: Any) -> Join[Made]:
-    """Return what makes the batch of one pair, by the class of the batch and what it takes besides."""
-    one = Pairs(((0, 1),))
-
-    def join(pair: Sequence[Path], output: Path, gone: Mapping[Path, Gone]) -> Batch[Made]:
-        return make(pair, output, *options, one, gone)
-
-    return join
+    def _join(self, number: int, gone: Mapping[Path, Gone]) -> Batch[Made]:
+        """Return the batch of one pair: of the files of its frames, of which some may be gone, into one file."""
+        paths = [self._found.targets[k].path for k in self._pairs[number]]
+        return self._of_pair(paths, self.targets[number].path, *self._given, Pairs(((0, 1),)), gone)

@@ -21,7 +21,7 @@ from lfpiv_cli.verbs.calibrate import CalibrateOptions, calibrate_snapshot
 from lfpiv_cli.verbs.combine import combine_vectors
 from lfpiv_cli.verbs.correlate import CorrelateOptions, Correlation, correlate_files
 from lfpiv_cli.verbs.follow import PLAYBACK, TRACKS, FollowOptions, follow_particles
-from lfpiv_cli.verbs.pairs import PairByPair, PairOptions, failures_of, joined_by
+from lfpiv_cli.verbs.pairs import PairByPair, PairOptions, failures_of
 from lfpiv_cli.verbs.particles import Prepared
 from lfpiv_cli.verbs.reconstruct import Reconstruction, ReconstructOptions, reconstruct_files
 from lfpiv_cli.verbs.steps import Steps
@@ -176,15 +176,13 @@ class Chain:
 
     def correlated(self, found: Reconstruction, file_bytes: float | None = None) -> PairByPair[correlating.Outcome]:
         """Return the batch of pairs, each from its images to its vectors, of so many bytes."""
-        join = joined_by(Correlation, self._correlating, self._overwrite)
         targets = [Target(path, dict) for path in self.of_pairs("vectors")]
-        return PairByPair(found, join, self.pairs, targets, file_bytes)
+        return PairByPair(found, Correlation, (self._correlating, self._overwrite), self.pairs, targets, file_bytes)
 
     def tracked(self, found: Reconstruction) -> PairByPair[tracking.Outcome]:
         """Return the batch of separate pairs, each from its images to its tracks."""
-        join = joined_by(Tracks, self._tracking, self._overwrite)
         targets = [Target(path, dict, grid_paths(path, 1)) for path in self.of_pairs("tracks")]
-        return PairByPair(found, join, self.pairs, targets)
+        return PairByPair(found, Tracks, (self._tracking, self._overwrite), self.pairs, targets)
 
     @property
     def _correlating(self) -> CorrelateOptions:
