@@ -68,10 +68,10 @@ class PlannedFrames(Batch[None]):
     """The frames of a sequence that can be read before any is followed, as `dry_run` asks of them."""
 
     targets: Sequence[Target]
-    beside: Sequence[Path]
     inputs: Sequence[Path]
-    left_out: Sequence[Failure]
     overwrite: bool
+    beside: Sequence[Path]
+    left_out: Sequence[Failure]
     label = "follow"
     unit = "frame"
 
@@ -207,7 +207,7 @@ def follow_particles(
     if options.dry_run:
         beside = [output / TRACKS, output / PLAYBACK, *(target.path for targets in passes[:-1] for target in targets)]
         here = [target for target, frame in zip(passes[-1], frames, strict=True) if frame.fault is None]
-        return dry_run(PlannedFrames(here, beside, inputs, left_out, overwrite), options, console)
+        return dry_run(PlannedFrames(here, inputs, overwrite, beside, left_out), options, console)
     content = searchable_weights(weights, content, settings)
     there = [number for number, frame in enumerate(frames) if frame.fault is None]
     needed = [_needed(targets, there, inputs, options, overwrite, targets is passes[-1]) for targets in passes]

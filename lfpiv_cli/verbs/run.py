@@ -9,7 +9,6 @@ why, and what each step told; `report.html` shows all of it.
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from itertools import pairwise
@@ -21,7 +20,7 @@ import numpy as np
 from lfpiv_cli.console import CONSOLE, Console
 from lfpiv_cli.errors import ConfigError, InputError, OutputExistsError, PartialError, UsageError
 from lfpiv_cli.files import images as image_files
-from lfpiv_cli.files.atomic import ensure_writable, without_nan, write_text
+from lfpiv_cli.files.atomic import ensure_writable, without_nan
 from lfpiv_cli.files.batch import Frame, frames_of, output_paths
 from lfpiv_cli.files.config import Config, load_config
 from lfpiv_cli.files.images import times_of
@@ -34,53 +33,48 @@ from lfpiv_cli.flow.field import REJECTED, VALID
 from lfpiv_cli.names import FlowMethod
 from lfpiv_cli.notice import written
 from lfpiv_cli.verbs import particles
-from lfpiv_cli.verbs.batches import ALL, Failure
+from lfpiv_cli.verbs.batches import ALL, Worked
 from lfpiv_cli.verbs.calibrate import ensure_pictures
 from lfpiv_cli.verbs.checks import quality_of, quality_of_all
 from lfpiv_cli.verbs.follow import SEQUENCE_IS_WHOLE
 from lfpiv_cli.verbs.following import SHORTEST, ensure_sequence
-from lfpiv_cli.verbs.frames import STILL, Background, mask_of, other_frames, read_frame, reader
+from lfpiv_cli.verbs.frames import mask_of, other_frames, read_frame, reader
 from lfpiv_cli.verbs.pairs import image_pairs
 from lfpiv_cli.verbs.particles import Prepared
 from lfpiv_cli.verbs.report import ReportOptions, report
 from lfpiv_cli.verbs.run_plan import planned, with_overwrite
-from lfpiv_cli.verbs.run_steps import Chain, RunOptions, Vectors
-from lfpiv_cli.verbs.steps import KEPT, MADE, RECORD, Steps, earlier_run
+from lfpiv_cli.verbs.run_steps import KEPT, MADE, RECORD, Chain, RunOptions, Steps, Vectors, earlier_run
 from lfpiv_cli.verbs.weights_cost import ensure_volume_fits
-
-# What `run` tells of the vectors of each method, side by side.
-
 
 # A range of displacements leaves out so many percent at either end, where a few are false.
 LEFT_OUT_PERCENT = 5.0
 
 
 def figures_of(fields: Mapping[str, Sequence[Path]]) -> dict[str, dict[str, float | int | None]]:
-    """Return how many vectors each method gives, how good they are and what they range over: figures by method."""
-    by_method = {method: _figures_of(paths) for method, paths in fields.items() if paths}
-    names = next(iter(by_method.values()), {})
-    return {name: {method: figures[name] for method, figures in by_method.items()} for name in names}
+    """Return how many vectors each method gives, how good they are and what they range over: figures by method.
 
-
-def _figures_of(paths: Sequence[Path]) -> dict[str, float | int | None]:
-    """Return the figures of a method's fields, which are read one after the other."""
-    qualities, displacements, valid = [], [], 0
-    for path in paths:
-        field = open_vectors(path)
-        qualities.append(quality_of(field))
-        displacements.append(field.displacement_voxel[field.flag < REJECTED])
-        valid += int(np.count_nonzero(field.flag == VALID))
-    quality, moved = quality_of_all(qualities), np.concatenate(displacements)
-    ends = LEFT_OUT_PERCENT, 100.0 - LEFT_OUT_PERCENT
-    low, high = np.percentile(moved, ends, axis=0) if len(moved) else np.full((2, 3), np.nan)
-    sigma = np.median(quality.sigma, axis=0) if len(quality.sigma) else np.full(3, np.nan)
-    told: dict[str, float | int | None] = {"vectors": quality.vectors, "valid": valid}
-    for k, name in enumerate("uvw"):
-        told |= {
-            f"{name}_from_voxel": without_nan(low[k]),
-            f"{name}_to_voxel": without_nan(high[k]),
-            f"{name}_sigma_voxel": without_nan(sigma[k]),
-        }
+    Files are read one after the other.
+    """
+    told: dict[str, dict[str, float | int | None]] = {}
+    for method, paths in fields.items():
+        if not paths:
+            continue
+        qualities, displacements, valid = [], [], 0
+        for path in paths:
+            field = open_vectors(path)
+            qualities.append(quality_of(field))
+            displacements.append(field.displacement_voxel[field.flag < REJECTED])
+            valid += int(np.count_nonzero(field.flag == VALID))
+        quality, moved = quality_of_all(qualities), np.concatenate(displacements)
+        ends = LEFT_OUT_PERCENT, 100.0 - LEFT_OUT_PERCENT
+        low, high = np.percentile(moved, ends, axis=0) if len(moved) else np.full((2, 3), np.nan)
+        sigma = np.median(quality.sigma, axis=0) if len(quality.sigma) else np.full(3, np.nan)
+        figures: dict[str, float | int | None] = {"vectors": quality.vectors, "valid": valid}
+        for k, name in enumerate("uvw"):
+            ranges = {"from": low[k], "to": high[k], "sigma": sigma[k]}
+            figures |= {f"{name}_{what}_voxel": without_nan(value) for what, value in ranges.items()}
+        for name, value in figures.items():
+            told.setdefault(name, {})[method] = value
     return told
 
 
@@ -137,7 +131,12 @@ def run(
 
 
 def _made(chain: Chain, choose: Callable[[Path], Choice], overwrite: bool) -> dict[str, Any]:
-    """Take all steps; return what is told of them."""
+    """Take all steps; return what is told of them.
+
+    Raises
+    ------
+    PartialError : something failed
+    """
     steps, options, output = chain.steps, chain.options, chain.steps.output
     ensure_writable(output / RECORD, overwrite=True)
     weights = chain.weights()
@@ -158,9 +157,27 @@ def _made(chain: Chain, choose: Callable[[Path], Choice], overwrite: bool) -> di
             *options.white,
             *options.board,
         )
-        told |= {"verdict": _reported(raw, steps, overwrite).get("verdict"), "report": str(output / REPORT)}
+        page = output / REPORT
+        is_kept = page.exists() and not steps.count(MADE)
+
+        def make() -> dict[str, Any]:
+            # Of all that the folder holds, where a step has made anything.
+            if is_kept:
+                return {}
+            replacing = overwrite or bool(steps.earlier)
+            return report(output, page, ReportOptions(raw=raw), overwrite=replacing, console=steps.console)
+
+        told |= {"verdict": steps.take("report", [page], make).get("verdict"), "report": str(page)}
     steps.write(whole=True)
-    return _ensure_whole(told | _told_of_steps(steps), chain.failures, options.failures)
+    told |= _told_of_steps(steps)
+    # By both methods a frame fails twice.
+    worked = Worked[None](failures=list(dict.fromkeys(chain.failures)))
+    worked.list_failures(options.failures)
+    if worked.failures:
+        first, records = worked.failures[0], [asdict(failure) for failure in worked.failures]
+        text = f"{len(records)} frames or pairs failed, the first {first.name}: {first.error}"
+        raise PartialError(text, told | {"failures": records})
+    return told
 
 
 def _told_of_steps(steps: Steps) -> dict[str, Any]:
@@ -168,49 +185,16 @@ def _told_of_steps(steps: Steps) -> dict[str, Any]:
     return {"steps_made": steps.count(MADE), "steps_kept": steps.count(KEPT), "folder": str(steps.output)}
 
 
-def _ensure_whole(told: dict[str, Any], failures: Sequence[Failure], listed: Path | None) -> dict[str, Any]:
-    """Return what is told of a run in which nothing failed; list what did, where it is asked for.
-
-    Raises
-    ------
-    PartialError : something did
-    """
-    # By both methods a frame fails twice.
-    records = [asdict(failure) for failure in dict.fromkeys(failures)]
-    if listed is not None:
-        write_text(listed, json.dumps(records, indent=2, ensure_ascii=False) + "\n", overwrite=True)
-    if failures:
-        first = f"{failures[0].name}: {failures[0].error}"
-        raise PartialError(f"{len(records)} frames or pairs failed, the first {first}", told | {"failures": records})
-    return told
-
-
-def _reported(raw: Sequence[Path], steps: Steps, overwrite: bool) -> dict[str, Any]:
-    """Make the page of all that the folder holds, where a step has made anything; return what it tells."""
-    page = steps.output / REPORT
-    is_kept = page.exists() and not steps.count(MADE)
-
-    def make() -> dict[str, Any]:
-        if is_kept:
-            return {}
-        replacing = overwrite or bool(steps.earlier)
-        return report(steps.output, page, ReportOptions(raw=raw), overwrite=replacing, console=steps.console)
-
-    return steps.take("report", [page], make)
-
-
 def _ensure_possible(settings: Config, options: RunOptions) -> tuple[list[Frame], Pairs]:
     """Return the frames of the flow and their pairs, after all that can be known to be wrong has been asked for."""
     _ensure_settings(settings, options)
-    _ensure_methods(settings, options)
     ensure_drawing()
     if options.report:
         ensure_pages()
     ensure_pictures(len(options.white), len(options.board), len(options.depth_mm))
     for path in (*options.white, *options.board):
         ensure_regular_file(split_part(path)[0])
-    mask = None if options.mask in (None, STILL) else Path(options.mask)
-    for path in filter(None, (options.dark, Background.parse(options.background).path, mask)):
+    for path in filter(None, (options.dark, options.level.path, options.mask_file)):
         image_files.read_reference(path, settings.image_shape())
     frames = frames_of(options.images, options.keep_going)
     if options.follow:
@@ -246,40 +230,27 @@ def _first_readable(frames: Sequence[Frame], shape: tuple[int, int], keep_going:
     raise InputError("no images were given")
 
 
-def _tell_times(images: Sequence[Path], keep_going: bool) -> bool:
-    """Return whether the recordings of the frames say when each was taken, of those that can be read.
-
-    Raises
-    ------
-    InputError : one cannot be read, and the others are not to go on
-    """
-    told = []
-    for path in images:
-        try:
-            told.append(times_of(path) is not None)
-        except InputError:
-            if not keep_going:
-                raise
-    return bool(told) and all(told)
-
-
 def _ensure_settings(settings: Config, options: RunOptions) -> None:
-    """Raise where the config lacks what a later step needs."""
-    is_stated = options.dt_s is not None or settings.correlation.dt_s is not None
-    if not is_stated and not _tell_times(options.images, options.keep_going):
-        raise ConfigError(
-            f"{settings.source}: correlation.dt_s: is missing, and velocities need it; give it there, or --dt-s"
-        )
+    """Raise where the config lacks what a later step needs, or contradicts the methods that are asked for."""
+    if options.dt_s is None and settings.correlation.dt_s is None:
+        # Whether recordings say when each frame was taken, those that can be read.
+        told = []
+        for path in options.images:
+            try:
+                told.append(times_of(path) is not None)
+            except InputError:
+                if not options.keep_going:
+                    raise
+        if not told or not all(told):
+            raise ConfigError(
+                f"{settings.source}: correlation.dt_s: is missing, and velocities need it; give it there, or --dt-s"
+            )
     settings.camera_model()
     settings.grid()
     if options.board:
         settings.rig()
     if settings.weights.method != "dlfc" and settings.channel is None:
         settings.object_space()
-
-
-def _ensure_methods(settings: Config, options: RunOptions) -> None:
-    """Raise where the methods that are asked for contradict the config or other options."""
     by_volumes, by_particles = (options.method in (method, "both") for method in ("volumes", "particles"))
     if options.combine and options.method != "both":
         raise UsageError("--combine needs --method both")
@@ -323,27 +294,19 @@ def _counted(
     settings: Config, options: RunOptions, weights: Path, frames: Sequence[Frame], prepared: Prepared, steps: Steps
 ) -> float | None:
     """Return how many tracers for each microlens the first image holds, as the run before has counted if it could."""
-    shape, level = settings.image_shape(), Background.parse(options.background)
+    shape, level = settings.image_shape(), options.level
     first = _first_readable(frames, shape, options.keep_going)
     files = (weights, frames[first].path, *filter(None, (options.dark, level.path)))
-    mask = "" if options.mask in (None, STILL) else sha256(Path(str(options.mask)))
+    mask = "" if options.mask_file is None else sha256(options.mask_file)
     words = other_frames(level, frames)(first)
     counted_from = " ".join([*map(sha256, files), str(frames[first].page), mask, words])
     steps.told["counted_from"] = hashlib.sha256(counted_from.encode()).hexdigest()
     if steps.earlier.get("counted_from") == steps.told["counted_from"] and "tracers_per_lens" in steps.earlier:
         return cast("float | None", steps.earlier["tracers_per_lens"])
-    return _tracers_per_lens(settings, options, weights, frames, first, prepared)
-
-
-def _tracers_per_lens(
-    settings: Config, options: RunOptions, weights: Path, frames: Sequence[Frame], first: int, prepared: Prepared
-) -> float | None:
-    """Return how many tracers for each microlens an image holds."""
     content = prepared.searchable(weights, settings)
-    shape, level = content.image_shape, Background.parse(options.background)
-    dark = image_files.read_reference(options.dark, shape) if options.dark else None
+    shape = content.image_shape
+    dark = options.dark_image(shape)
     # What stands still would take a look at every image, and a pair hardly shows it better than one counts without.
-    mask = None if options.mask == STILL else mask_of(options.mask, frames, shape, 0.0)
-    bench = prepared.bench(content, settings, dark, mask)
+    bench = prepared.bench(content, settings, dark, mask_of(options.mask_file, frames, shape, 0.0))
     read = reader(level, frames, shape, dark, options.keep_going)
     return particles.tracers_per_lens(bench, particles.frame_of(bench, *read(first)))

@@ -6,6 +6,7 @@ are counted, and their files taken for as large as their arrays are.
 
 from __future__ import annotations
 
+import contextlib
 import math
 import shutil
 from collections.abc import Callable, Mapping, Sequence
@@ -14,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from lfpiv_cli.errors import LfpivError
-from lfpiv_cli.files.batch import Target, pending
+from lfpiv_cli.files.batch import pending
 from lfpiv_cli.files.calibration_file import read_calibration
 from lfpiv_cli.files.config import Config
 from lfpiv_cli.files.provenance import Gone, carried_record, sha256, without_warnings
@@ -24,14 +25,8 @@ from lfpiv_cli.verbs.batches import AT_MOST, MB, RECORD_BYTES, Expected, dry_run
 from lfpiv_cli.verbs.build_weights import plan_of
 from lfpiv_cli.verbs.correlate import field_bytes
 from lfpiv_cli.verbs.follow import follow_particles
-from lfpiv_cli.verbs.run_steps import CALIBRATION, WEIGHTS, Chain
+from lfpiv_cli.verbs.run_steps import CALIBRATION, RESULTS, WEIGHTS, Chain
 from lfpiv_cli.verbs.weights_cost import FLOAT_BYTES, Cost, cost_of
-
-# By each method: the folder of the frames, that of the pairs, and what the work on either is called.
-NAMES: dict[FlowMethod, tuple[tuple[str, str], tuple[str, str]]] = {
-    "volumes": (("volumes", "reconstruct"), ("vectors", "correlate")),
-    "particles": (("particles", "reconstruct"), ("tracks", "track")),
-}
 
 
 def planned(settings: Config, chain: Chain, choose: Callable[[Path], Sequence[FlowMethod]]) -> dict[str, Any]:
@@ -43,18 +38,39 @@ def planned(settings: Config, chain: Chain, choose: Callable[[Path], Sequence[Fl
 
     Raises
     ------
-    LfpivError : the run would not begin
+    LfpivError : the run would not begin; as where calibration or weights are there, and were made from something else
     """
-    before = _steps_before_frames(chain)
+    output, options, console = chain.steps.output, chain.options, chain.steps.console
+    targets = {
+        "calibrate-snapshot": calibrate.target_of(chain.config, output / CALIBRATION, chain.photographs),
+        "build-weights": build_weights.target_of(chain.config, output / WEIGHTS, chain.made_with),
+    }
+    before: list[str] = []
+    for name, target in targets.items():
+        # What is made of something that is not there yet is made after it.
+        if before or pending([target], (), chain.common["overwrite"], resume=True, dry=True):
+            before.append(name)
     counts = {"frames": len(chain.order), "pairs": len(chain.share), "steps_to_make": before}
     if before:
         return counts | _from_nothing(settings, chain)
-    weights, to_come = chain.steps.output / WEIGHTS, _weights_to_come(chain)
+    weights, to_come = output / WEIGHTS, _weights_to_come(chain)
     methods = choose(weights)
     told: dict[str, dict[str, Any]] = {}
     for method in methods:
-        told |= _of_method(settings, chain, method, weights, to_come)
-    return counts | {"method": " and ".join(methods)} | _together(told, chain.steps.output)
+        if options.follow:
+            # The frames of a sequence depend on the whole config.
+            chosen = replace(chain.following(dry_run=True), resume=to_come is None)
+            told[method] = follow_particles(weights, options.images, output, chosen, **chain.common)
+            continue
+        found = chain.reconstruction(method, weights, to_come)
+        in_time = method == "particles" and not chain.pairs.separate
+        if options.keep == "all" or in_time:
+            told[method] = dry_run(found, chain.batch_options(shared=False), console)
+        if not in_time:
+            size = field_bytes(settings, settings.grid()) if method == "volumes" else None
+            batch = chain.in_pairs(method, found, size)
+            told[RESULTS[method]] = dry_run(batch, chain.batch_options(shared=True), console)
+    return counts | {"method": " and ".join(methods)} | _together(told, output)
 
 
 def with_overwrite(settings: Config, chain: Chain, choose: Callable[[Path], Sequence[FlowMethod]]) -> str:
@@ -70,8 +86,10 @@ def with_overwrite(settings: Config, chain: Chain, choose: Callable[[Path], Sequ
         again.append("what depends on it")
     else:
         for folder, number in told["to_make"].items():
-            again += [_of_all(folder, number, told["skipped"][folder])] if number else []
-            kept += [_of_all(folder, told["skipped"][folder], number)] if told["skipped"][folder] else []
+            # With how many of a folder's files are meant, unless all are.
+            skipped = told["skipped"][folder]
+            again += [f"{number} of {number + skipped} {folder}" if skipped else folder] if number else []
+            kept += [f"{skipped} of {number + skipped} {folder}" if number else folder] if skipped else []
         in_time = "particles" in told["to_make"] and not chain.pairs.separate
         if in_time and (told["to_make"]["particles"] or _weights_to_come(chain) is not None):
             again.append("tracks")
@@ -79,40 +97,8 @@ def with_overwrite(settings: Config, chain: Chain, choose: Callable[[Path], Sequ
             again.append("combined")
     if not again:
         return ""
-    return f"; with it the run makes {_listed(again)} again" + (f" and keeps {_listed(kept)}" if kept else "")
-
-
-def _of_all(folder: str, number: int, others: int) -> str:
-    """Return a folder's name, with how many of its files are meant unless all are."""
-    return f"{number} of {number + others} {folder}" if others else folder
-
-
-def _listed(names: Sequence[str]) -> str:
-    return " and ".join(filter(None, (", ".join(names[:-1]), names[-1])))
-
-
-def _steps_before_frames(chain: Chain) -> list[str]:
-    """Return which of the calibration and the weights would be made.
-
-    Raises
-    ------
-    LfpivError : one is there, and was made from something else
-    """
-    output = chain.steps.output
-    steps = (
-        ("calibrate-snapshot", calibrate.target_of(chain.config, output / CALIBRATION, chain.photographs)),
-        ("build-weights", build_weights.target_of(chain.config, output / WEIGHTS, chain.made_with)),
-    )
-    to_make: list[str] = []
-    for name, target in steps:
-        # What is made of something that is not there yet is made after it.
-        if to_make or _is_pending(target, chain):
-            to_make.append(name)
-    return to_make
-
-
-def _is_pending(target: Target, chain: Chain) -> bool:
-    return bool(pending([target], (), chain.common["overwrite"], resume=True, dry=True))
+    made, left = (" and ".join(filter(None, (", ".join(names[:-1]), names[-1]))) for names in (again, kept or [""]))
+    return f"; with it the run makes {made} again" + (f" and keeps {left}" if kept else "")
 
 
 def _weights_to_come(chain: Chain) -> Gone | None:
@@ -120,28 +106,6 @@ def _weights_to_come(chain: Chain) -> Gone | None:
     weights = chain.steps.output / WEIGHTS
     made = build_weights.target_of(chain.config, weights, chain.made_with).record
     return None if without_warnings(carried_record(weights)) == made else Gone(sha256(weights), made)
-
-
-def _of_method(
-    settings: Config, chain: Chain, method: FlowMethod, weights: Path, to_come: Gone | None
-) -> dict[str, dict[str, Any]]:
-    """Return what each batch of a method tells of itself, by its folder."""
-    (frames, _), (results, _) = NAMES[method]
-    console = chain.steps.console
-    if chain.options.follow:
-        # The frames of a sequence depend on the whole config.
-        chosen = replace(chain.following(dry_run=True), resume=to_come is None)
-        return {frames: follow_particles(weights, chain.options.images, chain.steps.output, chosen, **chain.common)}
-    told, found = {}, chain.reconstruction(method, weights, to_come)
-    in_time = method == "particles" and not chain.pairs.separate
-    if chain.options.keep == "all" or in_time:
-        told[frames] = dry_run(found, chain.batch_options(shared=False), console)
-    if method == "volumes":
-        batch = chain.correlated(found, field_bytes(settings, settings.grid()))
-        told[results] = dry_run(batch, chain.batch_options(shared=True), console)
-    elif not in_time:
-        told[results] = dry_run(chain.tracked(found), chain.batch_options(shared=True), console)
-    return told
 
 
 def _from_nothing(settings: Config, chain: Chain) -> dict[str, Any]:
@@ -153,16 +117,22 @@ def _from_nothing(settings: Config, chain: Chain) -> dict[str, Any]:
     methods: list[FlowMethod] = ["volumes", "particles"] if asked == "both" else ["volumes"]
     if asked == "particles":
         methods = ["particles"]
-    cost = _cost(settings, chain.steps.output / CALIBRATION)
+    calibration = chain.steps.output / CALIBRATION
+    cost: Cost | None = None
+    # What the weights will cost is not always known without a calibration.
+    with contextlib.suppress(LfpivError):
+        plan = plan_of(settings, read_calibration(calibration) if calibration.exists() else None)
+        cost = cost_of(settings, plan.camera, plan.source, plan.grid.padded(plan.padding))
     held = None if cost is None else cost.image_bytes
     sizes = {
         "volumes": (FLOAT_BYTES * math.prod(grid.shape_xyz), field_bytes(settings, grid)),
         "particles": (None, None),
     }
     told = {}
+    counts = ((len(chain.order), len(good)), (len(chain.share), len(whole)))
     for method in methods:
-        counts = ((len(chain.order), len(good)), (len(chain.share), len(whole)))
-        for (folder, label), (given, count), size in zip(NAMES[method], counts, sizes[method], strict=True):
+        names = ((method, "reconstruct"), (RESULTS[method], "correlate" if method == "volumes" else "track"))
+        for (folder, label), (given, count), size in zip(names, counts, sizes[method], strict=True):
             dropped = options.keep == "results" and chain.pairs.separate | (method == "volumes")
             if dropped and folder == method:
                 continue  # the files of a pair at a time
@@ -179,36 +149,23 @@ def _from_nothing(settings: Config, chain: Chain) -> dict[str, Any]:
     return {"method": told_method} | built | _together(told, chain.steps.output)
 
 
-def _cost(settings: Config, calibration: Path) -> Cost | None:
-    """Return what the weights will cost; None where that is not known without a calibration."""
-    try:
-        plan = plan_of(settings, read_calibration(calibration) if calibration.exists() else None)
-    except LfpivError:
-        return None
-    return cost_of(settings, plan.camera, plan.source, plan.grid.padded(plan.padding))
-
-
 def _together(told: Mapping[str, Mapping[str, Any]], output: Path) -> dict[str, Any]:
     """Return what several batches tell: the counts of each, the sums of disk and time, the most of memory."""
     working = [each for each in told.values() if each["to_make"]]
     there = next(path for path in (output.absolute(), *output.absolute().parents) if path.exists())
-    counts = {key: {name: each[key] for name, each in told.items()} for key in ("to_make", "skipped", "unreadable")}
+    figures: dict[str, Any] = {
+        key: {name: each[key] for name, each in told.items()} for key in ("to_make", "skipped", "unreadable")
+    }
+    for key, name in (("disk_mb", "disk"), ("seconds", "seconds")):
+        # A sum is known where all its parts are.
+        known = [each[key] for each in working]
+        figures |= {key: None if None in known else sum(known), f"{name}_by": _words(f"{name}_by", working)}
+        if name == "disk":
+            figures["disk_free_mb"] = shutil.disk_usage(there).free / MB
     memory = [each["memory_mb"] for each in working if each["memory_mb"] is not None]
+    figures |= {"memory_mb": max(memory, default=None), "memory_by": _words("memory_by", working)}
     listed = [path for each in told.values() for path in each.get("would_make", ())]
-    return (
-        counts
-        | _sum("disk", "disk_mb", working)
-        | {"disk_free_mb": shutil.disk_usage(there).free / MB}
-        | _sum("seconds", "seconds", working)
-        | {"memory_mb": max(memory, default=None), "memory_by": _words("memory_by", working)}
-        | ({"would_make": listed} if listed else {})
-    )
-
-
-def _sum(name: str, key: str, told: Sequence[Mapping[str, Any]]) -> dict[str, float | str | None]:
-    """Return the sum of a figure, if all know it, and by what they know it."""
-    known = [each[key] for each in told]
-    return {key: None if None in known else sum(known), f"{name}_by": _words(f"{name}_by", told)}
+    return figures | ({"would_make": listed} if listed else {})
 
 
 def _words(key: str, told: Sequence[Mapping[str, Any]]) -> str | None:
