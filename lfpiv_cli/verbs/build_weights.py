@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lfpiv_cli.calibration.model import Calibration
 from lfpiv_cli.console import CONSOLE, Console
@@ -20,7 +19,6 @@ from lfpiv_cli.files.calibration_file import read_calibration
 from lfpiv_cli.files.config import Config, load_config
 from lfpiv_cli.files.inputs import given
 from lfpiv_cli.files.provenance import record, with_warnings
-from lfpiv_cli.files.sections import WeightsSection
 from lfpiv_cli.files.weights_file import WeightsFile, open_weights, write_weights
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.names import Method, Refraction, Sampling
@@ -128,37 +126,54 @@ def plan_of(settings: Config, found: Calibration | None) -> Plan:
     camera = settings.camera_model()
     if found:
         camera = found.camera(camera)
-    reference = _reference(settings, found)
+    # Fitted rays count z from the origin that the boards' depths were told from.
+    reference = Reference(settings.volume.reference, 0.0)
+    if reference.name != "focal_point" and settings.weights.method != "dlfc":
+        if found is None or found.mid_plane_z_mm is None:
+            raise ConfigError(
+                "volume.reference: mid_plane needs a calibration with a board or with --depth-mm, and the section "
+                "channel: they say where the mid plane lies"
+            )
+        reference = Reference(reference.name, found.mid_plane_z_mm)
     grid = settings.grid(reference)
-    source = ray_source(settings, found)
-    padding = settings.reconstruction.padding_voxel or _padding(settings, camera, source, grid)
+    source, padding = ray_source(settings, found), settings.reconstruction.padding_voxel
+    if not padding and isinstance(source, CurvedSpace):
+        padding = curved_padding(camera, source, grid)
+    padding = padding or default_padding(camera, settings.media_model(), grid)
     check_rays(settings, source, grid.padded(padding))
+    # What may lie out of view without a word.
+    x, y, z = (-math.ceil(RIM_SHARE * n) if n > 2 else 0 for n in grid.shape_xyz)
     notices = [
         *rig_notices(settings, found, camera, source, grid),
-        *_view_notices(*seen_share(camera, source, _without_rim(grid)), grid),
+        *_view_notices(*seen_share(camera, source, grid.padded((x, y, z))), grid),
         *_reach_notices(settings, found, grid),
     ]
     return Plan(settings, found, camera, reference, grid, padding, source, notices)
 
 
 def weights_of(plan: Plan, provenance: dict[str, Any], console: Console) -> WeightsFile:
-    """Return the weights of a plan."""
+    """Return the weights of a plan: factorised where the axes separate, else on demand; or counted where asked for."""
     settings, camera, grid, found = plan.settings, plan.camera, plan.grid, plan.found
     if settings.volume.size_mm is not None:
         console.say(VOXELS_CHOSEN.format(*map(written, grid.spacing_mm)))
-    operator = make_operator(settings.weights, camera, plan.source, grid.padded(plan.padding), console)
+    padded, chosen = grid.padded(plan.padding), settings.weights
+    operator: WeightsOperator
+    if chosen.sampling == "exact" or isinstance(plan.source, PolynomialRays):
+        operator = operator_of(camera, plan.source, padded)
+        if isinstance(operator, OnDemandOperator):
+            console.say(ON_DEMAND)
+    else:
+        layout = OnDemandOperator(camera, plan.source, padded)
+        voxels, count = math.prod(layout.shape), RayCount(chosen.points, chosen.rays_per_point)
+        centres, rng = layout.centres_mm(np.arange(voxels)), np.random.default_rng(chosen.seed)
+        with console.progress(voxels, "count rays") as advance:
+            columns = count_columns(camera, plan.source, centres, layout.sides_mm, rng, count, advance)
+        operator = ColumnOperator(layout.shape, layout.image_shape, np.arange(voxels), columns)
     traced = isinstance(plan.source, ObjectSpace) and isinstance(operator, FactorisedOperator)
     bend = scene_distortion(camera, settings.media_model(), grid) if traced else None
     weights = Weights(grid, plan.padding, operator, camera.column_axis, found, bend)
     vignetting = found.vignetting() if found else None
     return WeightsFile(weights, camera, plan.reference, provenance, vignetting)
-
-
-def _padding(settings: Config, camera: Camera, source: Source, grid: Grid) -> tuple[int, int, int]:
-    """Return how many voxels to solve for beyond each side of a grid."""
-    if isinstance(source, CurvedSpace):
-        return curved_padding(camera, source, grid)
-    return default_padding(camera, settings.media_model(), grid)
 
 
 def curved_summary(content: WeightsFile) -> dict[str, Any]:
@@ -169,17 +184,19 @@ def curved_summary(content: WeightsFile) -> dict[str, Any]:
     """
     operator, outside = content.weights.solver_operator, {"voxels_outside_fluid": content.weights.voxels_outside_fluid}
     if isinstance(operator, StripOperator):
-        return {**_misfit_figures(operator.misfit_l1), **outside}
+        misfit = operator.misfit_l1
+        middle_and_worst = (
+            {
+                "column_misfit_l1_median": float(np.median(misfit)),
+                "column_misfit_l1_largest": float(misfit.max()),
+            }
+            if misfit.size
+            else {}
+        )
+        return middle_and_worst | outside
     if isinstance(operator, OnDemandOperator) and isinstance(operator.source, CurvedSpace):
         return {"ray_misfit_mm": aimed_misfit_mm(content.camera, operator.source, content.weights.grid), **outside}
     return {}
-
-
-def _misfit_figures(misfit_l1: NDArray[np.float64]) -> dict[str, float]:
-    """Return the middle and the worst of the columns' misfits; none where there are no columns."""
-    if not misfit_l1.size:
-        return {}
-    return {"column_misfit_l1_median": float(np.median(misfit_l1)), "column_misfit_l1_largest": float(misfit_l1.max())}
 
 
 def misfit_notices(content: WeightsFile) -> list[Notice]:
@@ -240,45 +257,6 @@ def _reach_notices(settings: Config, found: Calibration | None, grid: Grid) -> l
                 Notice("beyond-boards", "volume", text, remedy, float(beyond), f"at most {written(most)} mm")
             )
     return notices
-
-
-def make_operator(
-    chosen: WeightsSection, camera: Camera, source: Source, grid: Grid, console: Console
-) -> WeightsOperator:
-    """Return the weights of a grid: factorised where the axes separate, else on demand; or counted where asked for."""
-    if chosen.sampling == "exact" or isinstance(source, PolynomialRays):
-        operator = operator_of(camera, source, grid)
-        if isinstance(operator, OnDemandOperator):
-            console.say(ON_DEMAND)
-        return operator
-    layout = OnDemandOperator(camera, source, grid)
-    voxels, count = math.prod(layout.shape), RayCount(chosen.points, chosen.rays_per_point)
-    centres, rng = layout.centres_mm(np.arange(voxels)), np.random.default_rng(chosen.seed)
-    with console.progress(voxels, "count rays") as advance:
-        columns = count_columns(camera, source, centres, layout.sides_mm, rng, count, advance)
-    return ColumnOperator(layout.shape, layout.image_shape, np.arange(voxels), columns)
-
-
-def _reference(settings: Config, found: Calibration | None) -> Reference:
-    """Return the origin of the volume's coordinates.
-
-    Fitted rays count z from the origin that the boards' depths were told from.
-    """
-    name = settings.volume.reference
-    if name == "focal_point" or settings.weights.method == "dlfc":
-        return Reference(name, 0.0)
-    if found is None or found.mid_plane_z_mm is None:
-        raise ConfigError(
-            "volume.reference: mid_plane needs a calibration with a board or with --depth-mm, and the section channel: "
-            "they say where the mid plane lies"
-        )
-    return Reference(name, found.mid_plane_z_mm)
-
-
-def _without_rim(grid: Grid) -> Grid:
-    """Return a grid without what may lie out of view without a word."""
-    x, y, z = (-math.ceil(RIM_SHARE * n) if n > 2 else 0 for n in grid.shape_xyz)
-    return grid.padded((x, y, z))
 
 
 def _view_notices(smallest: float, largest: float, grid: Grid) -> list[Notice]:

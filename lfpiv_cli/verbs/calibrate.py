@@ -129,7 +129,12 @@ def photographs(
 def calibration_of(rig: Config, pictures: Photographs) -> Calibration:
     """Return the calibration that pictures of the rig give."""
     if pictures.mid_plane_z_mm is not None:
-        _check_mid_plane(pictures.mid_plane_z_mm, rig)
+        if not np.isfinite(pictures.mid_plane_z_mm):
+            raise UsageError(f"a depth of {pictures.mid_plane_z_mm:g} mm, expected a number")
+        if rig.channel is None:
+            raise ConfigError(
+                "a depth without a board is the mid plane's of a channel; the section `channel` is missing"
+            )
     camera = rig.complete_camera() if pictures.whites else rig.camera_model()
     if camera is not None:
         check_f_numbers(camera)
@@ -184,14 +189,6 @@ def light_notices(rig: Config, pictures: Photographs, found: Calibration) -> lis
         name = "board image" if len(boards) == 1 else f"board image {number}"
         notices += position_notices(images, pictures.less_dark(board), name, MOVED_SINCE_WHITE)
     return notices
-
-
-def _check_mid_plane(z_mm: float, rig: Config) -> None:
-    """Refuse a mid plane that is told where there is no channel, or no depth."""
-    if not np.isfinite(z_mm):
-        raise UsageError(f"a depth of {z_mm:g} mm, expected a number")
-    if rig.channel is None:
-        raise ConfigError("a depth without a board is the mid plane's of a channel; the section `channel` is missing")
 
 
 def ensure_pictures(whites: int, boards: int, depths: int) -> None:

@@ -137,8 +137,19 @@ def image_lines(bench: Bench, pictures: Pictures, lattice: Calibration | None) -
         number, tracer_light = _counted(bench, seen)
         asked.append([question(bench, seen) for question in QUESTIONS] + [_tracers(bench, seen, number)])
         asked[-1].append(_precision(bench, seen, tracer_light))
-        figures.append(_figures(seen, number, tracer_light))
-    lines = [_worst_of(answers) for answers in zip(*asked, strict=True)]
+        known = bool(np.isfinite(number))
+        figures.append(
+            {
+                "image": name,
+                "background_counts": seen.level,
+                "noise_counts": seen.noise,
+                "signal_to_noise": _signal(seen),
+                "tracers_per_lens": number if known else None,
+                "tracer_counts": tracer_light if known else None,
+            }
+        )
+    # The first of the worst answers to each question.
+    lines = [next(line for line in every if line.verdict == worst(every)) for every in zip(*asked, strict=True)]
     return lines, {name: [each[name] for each in figures] for name in figures[0]} if figures else {}
 
 
@@ -158,22 +169,14 @@ def _seen(bench: Bench, name: str, raw: Image, dark: Image | None, lattice: Cali
     if lattice is not None:
         width = bench.camera.lens_image_width
         lens_images = LensImages.of(lattice.rectification, lattice.transmission, width)
-    return Seen(
-        name, raw, too_bright, less_dark, *_background_of(less_dark, dark is not None, lens_images), lens_images
-    )
-
-
-def _background_of(less_dark: Image, has_dark: bool, lens_images: LensImages | None) -> tuple[float, float]:
-    """Return level and noise of a background, between the lens images where it is known where they lie."""
+    # Of the background, between the lens images where it is known where they lie.
     if lens_images is not None:
-        return lens_images.background(less_dark)
-    return (0.0, read_noise(less_dark.astype(np.float64))) if has_dark else dark_level(less_dark.ravel())
-
-
-def _worst_of(answers: Sequence[Line]) -> Line:
-    """Return the first of the worst answers to one question."""
-    verdict = worst(answers)
-    return next(line for line in answers if line.verdict == verdict)
+        level, noise = lens_images.background(less_dark)
+    elif dark is not None:
+        level, noise = 0.0, read_noise(less_dark.astype(np.float64))
+    else:
+        level, noise = dark_level(less_dark.ravel())
+    return Seen(name, raw, too_bright, less_dark, level, noise, lens_images)
 
 
 def _counted(bench: Bench, seen: Seen) -> tuple[float, float]:
@@ -186,19 +189,15 @@ def _counted(bench: Bench, seen: Seen) -> tuple[float, float]:
     number, tracer_light = planning.tracers_per_lens(bench.camera, bench.seen[0], lit)
     if np.isfinite(number):
         return number, tracer_light
-    crowded = _crowded(bench, seen)
-    if crowded is None:
-        return number, tracer_light
-    return crowded, lit[2] * float(bench.camera.micro_image_lattice_px().cell_area) / crowded
-
-
-def _crowded(bench: Bench, seen: Seen) -> float | None:
-    """Return tracers for each lens where hardly a pixel is dark; None where nobody can tell."""
+    # Where hardly a pixel is dark; None where nobody can tell.
     camera, padding = bench.camera, default_padding(bench.camera, bench.media, bench.grid)
     view = raw_view(camera, bench.media, bench.tracer().radius_mm, bench.found)
     lattice_px = camera.micro_image_lattice_px() if bench.found is None else bench.found.fit.lattice_px
     seeded = Seeded(view, camera, bench.grid.padded(padding), bench.grid, bench.grid.bounds_mm(2))
-    return tracers_in_image(seeded, seen.less_dark.astype(np.float64), np.isfinite(seen.less_dark), lattice_px)
+    crowded = tracers_in_image(seeded, seen.less_dark.astype(np.float64), np.isfinite(seen.less_dark), lattice_px)
+    if crowded is None:
+        return number, tracer_light
+    return crowded, lit[2] * float(bench.camera.micro_image_lattice_px().cell_area) / crowded
 
 
 def _exposure(bench: Bench, seen: Seen) -> Line:
@@ -269,7 +268,8 @@ def _beyond(bench: Bench, seen: Seen) -> Line:
     about = "light outside"
     if bench.found is None and not aligned(bench.camera):
         return Line(about, "unknown", "the array is not aligned with the sensor: --calibration, or --white")
-    if bench.settings.volume.reference == "mid_plane" and not bench.knows_mid_plane:
+    knows_mid_plane = bench.found is not None and bench.found.mid_plane_z_mm is not None
+    if bench.settings.volume.reference == "mid_plane" and not knows_mid_plane:
         return Line(about, "unknown", "where the volume lies a calibration with a board tells: --calibration")
     picture = seen.above
     if bench.found is not None:
@@ -296,32 +296,16 @@ def _precision(bench: Bench, seen: Seen, tracer_light: float) -> Line:
     about = "precision, measured"
     if not 0.0 < tracer_light < np.inf:
         return Line(about, "unknown", f"{seen.name}: no tracer could be told from others")
-    errors = _errors(bench, seen, tracer_light)
+    # The median smallest errors (3,) of tracers of this light, with the noise of the image.
+    plain = bench.tracer()
+    tracer = replace(plain, light_counts=tracer_light, readout=replace(plain.readout, read_noise_counts=seen.noise))
+    errors = np.median(bench.errors_of(tracer), axis=0)
     reason = (
         f"{seen.name}: a tracer alone of {written(tracer_light, 2)} counts, as here, is placed to "
         f"{written(1e3 * errors[0], 2)} um across and {written(1e3 * errors[2], 2)} um in depth at best, "
         f"{by_which_light(bench)}"
     )
     return Line(about, error_verdict(bench, errors[2]), reason)
-
-
-def _errors(bench: Bench, seen: Seen, tracer_light: float) -> NDArray[np.float64]:
-    """Return the median smallest errors (3,) of tracers of a light, with the noise of an image."""
-    plain = bench.tracer()
-    tracer = replace(plain, light_counts=tracer_light, readout=replace(plain.readout, read_noise_counts=seen.noise))
-    return np.asarray(np.median(bench.errors_of(tracer), axis=0))
-
-
-def _figures(seen: Seen, number: float, tracer_light: float) -> dict[str, Any]:
-    known = np.isfinite(number)
-    return {
-        "image": seen.name,
-        "background_counts": seen.level,
-        "noise_counts": seen.noise,
-        "signal_to_noise": _signal(seen),
-        "tracers_per_lens": number if known else None,
-        "tracer_counts": tracer_light if known else None,
-    }
 
 
 QUESTIONS: Sequence[Callable[[Bench, Seen], Line]] = (_exposure, _light, _background, _lens_images, _beyond)
@@ -379,11 +363,7 @@ def check(
         of_images, measured = image_lines(bench, pictures, found)
         lines, figures = [*lines, *of_images], figures | measured
     if options.picture is not None:
-        _draw(options.picture, bench, overwrite)
+        from lfpiv_cli.pictures.calibration import planning_figure
+
+        write_picture(options.picture, planning_figure(by_depth(bench), bench.bounds_mm), overwrite)
     return {"verdicts": [line.row() for line in lines], **figures, "verdict": worst(lines)}
-
-
-def _draw(path: Path, bench: Bench, overwrite: bool) -> None:
-    from lfpiv_cli.pictures.calibration import planning_figure
-
-    write_picture(path, planning_figure(by_depth(bench), bench.bounds_mm), overwrite)

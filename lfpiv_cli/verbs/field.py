@@ -41,9 +41,6 @@ from lfpiv_cli.verbs.fields import (
 from lfpiv_cli.verbs.means import Extra, arrays_of
 from lfpiv_cli.verbs.tracks import seen_in, settings_of
 
-# Pressure from a sequence's trajectories, in memory.
-
-
 MM2_PER_M2 = 1e6
 
 
@@ -97,9 +94,11 @@ def pressure_of(
         raise InputError(f"{len(particles)} frames: too few tracks pass five of them, which accelerations need")
     tracks, motion = motions_at(found, seen, number, derivatives)
     sure = link_probability(trajectories)[tracks]
-    moving = Samples(
-        motion.position_mm, motion.velocity, _velocity_covariance(trajectories, number, tracks, dt_s), sure
-    )
+    # The covariances (n, 3, 3) of the tracks' velocities in the frame, mm^2 per frame^2, as the file states.
+    here = np.flatnonzero(trajectories.arrays["frame"] == number)
+    row = here[np.searchsorted(trajectories.arrays["track"][here], tracks)]
+    sigma = trajectories.arrays["velocity_sigma"][row] * dt_s / MM_TO_M
+    moving = Samples(motion.position_mm, motion.velocity, sigma[:, :, np.newaxis] ** 2 * np.eye(3), sure)
     low, high = motion.position_mm.min(axis=0), motion.position_mm.max(axis=0)
     # mm^2/s times s per frame times mm per frame per mm^2
     friction = viscosity / density * MM2_PER_M2 * dt_s * pressure.laplacian_at(
@@ -178,14 +177,6 @@ def neglected_share(motion: Motion) -> float:
     return float(np.linalg.norm(motion.neglected) / np.linalg.norm(motion.acceleration))
 
 
-def _velocity_covariance(points: Points, number: int, tracks: NDArray[np.int64], dt_s: float) -> Floats:
-    """Return the covariances (n, 3, 3) of the tracks' velocities in a frame, mm^2 per frame^2, as the file states."""
-    here = np.flatnonzero(points.arrays["frame"] == number)
-    row = here[np.searchsorted(points.arrays["track"][here], tracks)]
-    sigma = points.arrays["velocity_sigma"][row] * dt_s / MM_TO_M
-    return np.asarray(sigma[:, :, np.newaxis] ** 2 * np.eye(3))
-
-
 def _rms(vectors: Floats) -> Floats:
     return np.asarray(np.sqrt(np.mean(vectors**2, axis=0)))
 
@@ -259,7 +250,13 @@ def fit_flow(
     ensure_one_time(header.attributes.get("dt_s") for header in headers)
     settings = settings_of([header.provenance for header in headers], names, options.dt_s, OF_COORDINATES)
     pressed = _pressure(paths, settings, options)
-    found = fitted(_samples(paths, options), settings, options.divergence, names[0])
+    parts = [
+        samples_of_vectors(vtkhdf.open_vectors(path), str(path))
+        if format_of(path) == vtkhdf.VECTORS_FORMAT
+        else samples_of_tracks(read_tracks(path), options.frame)
+        for path in paths
+    ]
+    found = fitted(parts, settings, options.divergence, names[0])
     notices = fit_notices(found.summary, options.divergence, paths[0].name)
     console.warn(notices)
     inputs = {f"samples_{number:04d}": path for number, path in enumerate(paths)}
@@ -267,7 +264,13 @@ def fit_flow(
     chosen = {"divergence": options.divergence, "frame": options.frame, "derived": options.derived}
     made = with_warnings(record("field", settings.resolved() | {"field": chosen}, inputs), notices)
     vectors = found.vectors()
-    extra = _derived(found) if options.derived else {}
+    extra: Extra = {}
+    if options.derived:
+        # What follows from the field's gradients, and these, row by row.
+        gradients = found.gradients()
+        flat = gradients.reshape(*gradients.shape[:3], 9)
+        extra = arrays_of(found.derived())
+        extra |= {f"gradient_{name}": (flat[..., 3 * row : 3 * row + 3], "1/s") for row, name in enumerate("uvw")}
     if pressed is not None:
         extra |= {"pressure": (pressed.pressure_pa, "Pa"), "pressure_sigma": (pressed.pressure_sigma_pa, "Pa")}
     vtkhdf.write_vectors(output, vectors, headers[0].reference, provenance=made, overwrite=overwrite, extra=extra)
@@ -275,27 +278,10 @@ def fit_flow(
         write_text(places, _table(points, found), overwrite)
     figures = {} if pressed is None else pressed.figures
     if options.derived:
-        figures = figures | found.turbulence(_viscosity_m2_s(settings))
-    return found.summary | figures | _figures(vectors)
-
-
-def _viscosity_m2_s(settings: Config) -> float | None:
-    """Return the kinematic viscosity, None where the config does not say it."""
-    media = settings.media
-    if media.fluid_density_kg_m3 is None or media.fluid_viscosity_pa_s is None:
-        return None
-    return media.fluid_viscosity_pa_s / media.fluid_density_kg_m3
-
-
-def _samples(paths: Sequence[Path], options: FieldOptions) -> list[Samples]:
-    """Return the samples of each file."""
-    parts = []
-    for path in paths:
-        if format_of(path) == vtkhdf.VECTORS_FORMAT:
-            parts.append(samples_of_vectors(vtkhdf.open_vectors(path), str(path)))
-        else:
-            parts.append(samples_of_tracks(read_tracks(path), options.frame))
-    return parts
+        density, viscosity = settings.media.fluid_density_kg_m3, settings.media.fluid_viscosity_pa_s
+        kinematic = None if density is None or viscosity is None else viscosity / density
+        figures = figures | found.turbulence(kinematic)
+    return found.summary | figures | _counts(vectors)
 
 
 def _pressure(paths: Sequence[Path], settings: Config, options: FieldOptions) -> PressureResult | None:
@@ -311,16 +297,7 @@ def _pressure(paths: Sequence[Path], settings: Config, options: FieldOptions) ->
         raise InputError(f"{paths[0]} with {options.pressure[0].parent}: {error}") from error
 
 
-def _derived(found: FittedField) -> Extra:
-    """Return what follows from the field's gradients, and these, row by row."""
-    gradients = found.gradients()
-    flat = gradients.reshape(*gradients.shape[:3], 9)
-    return arrays_of(found.derived()) | {
-        f"gradient_{name}": (flat[..., 3 * row : 3 * row + 3], "1/s") for row, name in enumerate("uvw")
-    }
-
-
-def _figures(vectors: VectorField) -> dict[str, Any]:
+def _counts(vectors: VectorField) -> dict[str, Any]:
     """Return how many vectors there are, and how well they are known."""
     kept, sigma = vectors.flag < REJECTED, vectors.uncertainty_voxel
     known = sigma is not None and kept.any()

@@ -171,20 +171,15 @@ def fit_field(
     settings = rig or next((each.settings for each in given if isinstance(each, Tracked)), None)
     if settings is None:
         raise InputError("vectors alone do not tell the grid: give the rig")
-    _ensure_one_flow(given, settings.correlation.dt_s)
+    times = (each.settings.correlation.dt_s if isinstance(each, Tracked) else each.dt_s for each in given)
+    ensure_one_time([*times, settings.correlation.dt_s])
+    if len({each.points.reference for each in given if isinstance(each, Tracked)}) > 1:
+        raise InputError("the tracks' coordinates have different origins")
     parts = [
         samples_of_tracks(each.points) if isinstance(each, Tracked) else samples_of_vectors(each, "vectors")
         for each in given
     ]
     return fitted(parts, settings, divergence, "field")
-
-
-def _ensure_one_flow(given: Sequence[Tracked | VectorField], dt_s: float | None) -> None:
-    """Raise InputError where steps in time or origins of places differ."""
-    times = (each.settings.correlation.dt_s if isinstance(each, Tracked) else each.dt_s for each in given)
-    ensure_one_time([*times, dt_s])
-    if len({each.points.reference for each in given if isinstance(each, Tracked)}) > 1:
-        raise InputError("the tracks' coordinates have different origins")
 
 
 def ensure_one_time(times_s: Iterable[float | None]) -> None:
@@ -225,7 +220,17 @@ def samples_of_tracks(points: Points, frame: int | None = None) -> Samples:
     """
     arrays = points.arrays
     if "frame" in arrays:
-        return _samples_in(points, frame)
+        last = int(arrays["frame"].max(initial=-1))
+        number = (last + 1) // 2 if frame is None else frame
+        if not 0 <= number <= last:
+            raise UsageError(f"frame {number} is none of {last + 1}, which are counted from 0")
+        # Places and velocities of fits in time.
+        here, to_mm = arrays["frame"] == number, float(points.attributes["dt_s"]) / MM_TO_M
+        sigma_mm = to_mm * arrays["velocity_sigma"][here]
+        covariance = sigma_mm[:, :, np.newaxis] ** 2 * np.eye(3)
+        probability = np.nan_to_num(arrays["link_probability"][here], nan=1.0)
+        value_mm = to_mm * arrays["velocity"][here]
+        return Samples(points.position_mm[here], value_mm, covariance, probability, place_share=0.0)
     if frame is not None:
         raise UsageError("a frame is of a sequence, and these are tracks of a pair")
     displacement = arrays["displacement_mm"]
@@ -246,25 +251,6 @@ def paths_of(tracks: Points) -> list[Paths]:
         Paths(each.points_mm, each.value_mm, np.sqrt(np.diagonal(each.covariance_mm2, axis1=1, axis2=2)))
         for each in every
     ]
-
-
-def _samples_in(points: Points, frame: int | None) -> Samples:
-    """Return a sequence's tracks in a frame as samples: places and velocities of fits in time."""
-    arrays = points.arrays
-    last = int(arrays["frame"].max(initial=-1))
-    number = (last + 1) // 2 if frame is None else frame
-    if not 0 <= number <= last:
-        raise UsageError(f"frame {number} is none of {last + 1}, which are counted from 0")
-    here = arrays["frame"] == number
-    to_mm = float(points.attributes["dt_s"]) / MM_TO_M
-    sigma_mm = to_mm * arrays["velocity_sigma"][here]
-    return Samples(
-        points.position_mm[here],
-        to_mm * arrays["velocity"][here],
-        sigma_mm[:, :, np.newaxis] ** 2 * np.eye(3),
-        np.nan_to_num(arrays["link_probability"][here], nan=1.0),
-        place_share=0.0,
-    )
 
 
 def samples_of_vectors(field: VectorField, name: str) -> Samples:

@@ -93,7 +93,9 @@ def mean_of_measured(
     ------
     InputError : they were not made alike
     """
-    files = _without_gridded(files)
+    # Tracks whose vectors on a grid (`track --grid`) are among the files are left out.
+    gridded = {path.parent / path.stem.rpartition("_grid")[0] for path in files}
+    files = [path for path in files if path.with_suffix("") not in gridded or format_of(path) == vtkhdf.VECTORS_FORMAT]
     headers = [vtkhdf.read_header(path) for path in files]
     for header, path in zip(headers, files, strict=True):
         if header.reference != headers[0].reference:
@@ -108,12 +110,6 @@ def mean_of_measured(
     found = vtkhdf.open_vectors(mean)
     told = {"files": len(files), "skipped": worked.skipped, "vectors": found.flag.size}
     return told | {"rejected": int(np.count_nonzero(found.flag >= REJECTED))} | quality_of(found).summary()
-
-
-def _without_gridded(files: Sequence[Path]) -> list[Path]:
-    """Return files without the tracks whose vectors on a grid (`track --grid`) are among them."""
-    gridded = {path.parent / path.stem.rpartition("_grid")[0] for path in files}
-    return [path for path in files if path.with_suffix("") not in gridded or format_of(path) == vtkhdf.VECTORS_FORMAT]
 
 
 def _fields_in(path: Path) -> Iterator[VectorField]:

@@ -5,6 +5,7 @@ A line is good, or worth a look, or says that the experiment cannot work so; or 
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -32,7 +33,7 @@ from lfpiv_cli.validation.planning import Miniature, Tracer
 from lfpiv_cli.verbs.build_weights import ray_source
 from lfpiv_cli.verbs.particles import light_of
 from lfpiv_cli.verbs.verdicts import WORDS, Word
-from lfpiv_cli.verbs.weights_cost import check_rig, cost_notices, cost_of, particles_core_s, rig_notices
+from lfpiv_cli.verbs.weights_cost import Cost, check_rig, cost_notices, cost_of, particles_core_s, rig_notices
 from lfpiv_cli.weights.build import default_padding
 from lfpiv_cli.weights.scene import Source
 
@@ -104,11 +105,6 @@ class Bench:
         return self.camera.scale(self.media)
 
     @property
-    def knows_mid_plane(self) -> bool:
-        """Whether a calibration tells where a channel's mid plane lies."""
-        return self.found is not None and self.found.mid_plane_z_mm is not None
-
-    @property
     def mid_plane_z_mm(self) -> float:
         """Depth of a channel's mid plane; where it is not known, the camera is focused on it."""
         return (self.found.mid_plane_z_mm if self.found else None) or 0.0
@@ -174,8 +170,15 @@ def bench_of(settings: Config, found: Calibration | None, velocity_m_s: float | 
     z_mm = 0.0 if found is None or found.mid_plane_z_mm is None else found.mid_plane_z_mm
     named = settings.volume.reference
     grid = settings.grid(Reference(named, z_mm if named == "mid_plane" else 0.0))
-    velocity = velocity_m_s if velocity_m_s is not None else _configured_speed_m_s(settings)
-    return Bench(settings, found, camera, settings.media_model(), grid, velocity)
+    if velocity_m_s is None:
+        # That of the configured flow in the volume, where there is a flow.
+        with contextlib.suppress(ConfigError):
+            flow, volume = settings.true_flow(), settings.grid()
+            axes = [np.linspace(*volume.bounds_mm(axis), FLOW_POINTS) for axis in range(3)]
+            points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+            speed = float(np.percentile(np.linalg.norm(flow(points), axis=1), FAST_PERCENTILE))
+            velocity_m_s = speed if speed > 0.0 else None
+    return Bench(settings, found, camera, settings.media_model(), grid, velocity_m_s)
 
 
 def rig_lines(bench: Bench) -> list[Line]:
@@ -224,7 +227,14 @@ def rig_figures(bench: Bench) -> dict[str, Any]:
         "expected_velocity_m_s": bench.velocity_m_s,
         "best_dt_s": _best_time_s(bench),
     }
-    return figures | {"estimated_particles_core_s": particles_core_s(best)} | _cost_figures(bench)
+    figures["estimated_particles_core_s"] = particles_core_s(best)
+    # Bytes and seconds for one image, where the rig can be worked with at all.
+    with contextlib.suppress(ConfigError, InputError):
+        figures |= _cost_of(bench).summary() | {
+            "image_file_bytes": PIXEL_BYTES * camera.columns * camera.rows,
+            "volume_file_bytes": VOXEL_BYTES * int(np.prod(bench.grid.shape_xyz)),
+        }
+    return figures
 
 
 def by_depth(bench: Bench) -> dict[str, NDArray[np.float64]]:
@@ -236,19 +246,6 @@ def by_depth(bench: Bench) -> dict[str, NDArray[np.float64]]:
         "full_view_mm": planning.half_view_mm(camera, media, depths),
         "any_view_mm": planning.half_view_mm(camera, media, depths, 1.0),
     }
-
-
-def _configured_speed_m_s(settings: Config) -> float | None:
-    """Return the speed of the configured flow in the volume, None where there is no flow."""
-    try:
-        flow = settings.true_flow()
-    except ConfigError:
-        return None
-    grid = settings.grid()
-    axes = [np.linspace(*grid.bounds_mm(axis), FLOW_POINTS) for axis in range(3)]
-    points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    speed = float(np.percentile(np.linalg.norm(flow(points), axis=1), FAST_PERCENTILE))
-    return speed if speed > 0.0 else None
 
 
 def graded(value: float, good: float, limit: float) -> Verdict:
@@ -363,7 +360,9 @@ def error_verdict(bench: Bench, depth_error_mm: float) -> Verdict:
 
 
 def _seeding(bench: Bench) -> Line:
-    return seeding_line(bench, bench.settings.simulation.particles / _lenses(bench), "simulated")
+    # Of the microlenses that look into the volume.
+    lenses = max(planning.tracers_in(bench.camera, 1.0, bench.sides_mm), 1.0)
+    return seeding_line(bench, bench.settings.simulation.particles / lenses, "simulated")
 
 
 def seeding_line(bench: Bench, per_lens: float, what: str) -> Line:
@@ -379,11 +378,6 @@ def seeding_line(bench: Bench, per_lens: float, what: str) -> Line:
     if per_lens > planning.CROWDED_PER_LENS:
         reason += ": neighbours are taken for one another, volumes err less than particles"
     return Line("seeding", graded(per_lens, planning.CROWDED_PER_LENS, planning.MOST_PER_LENS), reason)
-
-
-def _lenses(bench: Bench) -> float:
-    """Return the microlenses that look into the volume."""
-    return max(planning.tracers_in(bench.camera, 1.0, bench.sides_mm), 1.0)
 
 
 def _voxels(bench: Bench) -> Line:
@@ -460,18 +454,7 @@ def _time_step(bench: Bench) -> Line:
     return Line(about, "no" if beyond else "look", f"{reason}; {advice}")
 
 
-def _cost_figures(bench: Bench) -> dict[str, Any]:
-    """Return bytes and seconds for one image, where the rig can be worked with at all."""
-    try:
-        return _cost_of(bench).summary() | {
-            "image_file_bytes": PIXEL_BYTES * bench.camera.columns * bench.camera.rows,
-            "volume_file_bytes": VOXEL_BYTES * int(np.prod(bench.grid.shape_xyz)),
-        }
-    except (ConfigError, InputError):
-        return {}
-
-
-def _cost_of(bench: Bench) -> Any:
+def _cost_of(bench: Bench) -> Cost:
     settings, camera = bench.settings, bench.camera
     padding = settings.reconstruction.padding_voxel or default_padding(camera, bench.media, bench.grid)
     return cost_of(settings, camera, _source(bench), bench.grid.padded(padding))

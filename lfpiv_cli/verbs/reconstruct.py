@@ -27,7 +27,7 @@ from lfpiv_cli.files.provenance import Gone, also_used_as, record, with_warnings
 from lfpiv_cli.files.vtkhdf import Volume
 from lfpiv_cli.files.weights_file import WeightsFile, read_weights_record
 from lfpiv_cli.names import Start
-from lfpiv_cli.notice import Notice, warn_of
+from lfpiv_cli.notice import Notice, warn_of, written
 from lfpiv_cli.reconstruction.images import Image, as_if_lit, filled, light
 from lfpiv_cli.reconstruction.registry import SolverName
 from lfpiv_cli.reconstruction.solvers import reconstruct as solve
@@ -55,7 +55,7 @@ from lfpiv_cli.verbs.frames import (
 from lfpiv_cli.verbs.pairs import PairOptions, image_pairs, watched, work_as_they_come
 from lfpiv_cli.verbs.particles import Finder, Prepared
 from lfpiv_cli.verbs.tracers import TracerSize, light_notices, size_notices
-from lfpiv_cli.verbs.weights_cost import FLOAT_BYTES, columns_bytes, held_bytes, on_demand_told
+from lfpiv_cli.verbs.weights_cost import COLUMN_S, FLOAT_BYTES, columns_bytes, held_bytes
 
 
 def reconstruct(
@@ -306,7 +306,11 @@ class Reconstruction(Batch[Outcome]):
         prepared, weights = self._prepared, self._common["weights"]
         content = prepared.searchable(weights, settings) if self._as_particles else prepared.weights(weights)
         if not self._as_particles and content.weights.on_demand:
-            console.say(on_demand_told(math.prod(content.weights.padded.shape)))
+            voxels = math.prod(content.weights.padded.shape)
+            console.say(
+                f"columns are made on demand: up to {written(voxels * COLUMN_S / 60.0, 2)} minutes of a core for each "
+                f"image, where all {written(voxels)} voxels can be lit"
+            )
         shape = content.image_shape
         if not self._as_particles:
             # The weights are in memory by now.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
@@ -23,7 +23,6 @@ from lfpiv_cli.files.pairing import Pairs
 from lfpiv_cli.files.particle_file import (
     PARTICLES_FORMAT,
     TRAJECTORIES_FORMAT,
-    PointRows,
     Points,
     StoredTracks,
     TrackStore,
@@ -32,7 +31,7 @@ from lfpiv_cli.files.particle_file import (
     write_points,
 )
 from lfpiv_cli.files.provenance import carried_record, record, with_warnings
-from lfpiv_cli.flow.field import REJECTED, VectorField
+from lfpiv_cli.flow.field import REJECTED
 from lfpiv_cli.names import GridMethod
 from lfpiv_cli.reference import Reference
 from lfpiv_cli.tracks.candidates import Seen, Trajectories
@@ -60,9 +59,6 @@ from lfpiv_cli.verbs.tracks import (
     tracking_of,
     tracks_through,
 )
-
-# The tracks of a sequence as they are put together: on a disk, with the last few frames in memory.
-
 
 # States look at so many frames, one after the other; forecasts at fewer.
 KEPT_FRAMES = 2 * max(HALVES_FRAMES) + 1
@@ -215,9 +211,8 @@ class Tracks(PairBatch[Outcome, TrackOptions]):
         settings = settings_of(records, names, self._options.dt_s)
         chosen = tracking_of(settings, self._options.search_voxel, self._options.shortest, len(paths), names[0])
         with _tracks(paths, read, settings, chosen, dict(target.record), target.path.parent) as found:
-            told = {
-                f"{role} {path.name}": made for (role, path), made in zip(_roles(paths).items(), records, strict=True)
-            }
+            roles = zip(_roles(paths).items(), records, strict=True)
+            told = {f"{role} {path.name}": made for (role, path), made in roles}
             doubts = dt_notices(chosen.dt_s, pairwise(records), paths[0].name)
             few = few_notices(counts, [path.name for path in paths], found.summary, found.points)
             notices = [*doubts, *calibration_notices(told), *few]
@@ -227,9 +222,26 @@ class Tracks(PairBatch[Outcome, TrackOptions]):
             replacing = self.overwrite or self._options.resume
             points = replace(found.points, provenance=provenance)
             write_points(target.path, found.format_name, points, overwrite=replacing)
-            fields = found.fields() if self._options.by == "polynomials" else _fitted(found, names[0])
-            qualities, rejected = _write_grids(target.beside, fields, points, replacing, work.console)
-            return Outcome(found.summary | _sigmas(found.points), qualities, rejected)
+            if self._options.by == "polynomials":
+                fields = found.fields()
+            else:
+                fields = (each.vectors() for each in fields_of(found, names[0]))
+            qualities, rejected = [], 0
+            for path, field in zip(target.beside, fields if target.beside else (), strict=True):
+                quality = quality_of(field)
+                notices = list(field_notices(quality, path.name))
+                work.console.warn(notices)
+                made = with_warnings(points.provenance, notices)
+                vtkhdf.write_vectors(path, field, points.reference, provenance=made, overwrite=replacing)
+                qualities.append(quality)
+                rejected += int(np.count_nonzero(field.flag >= REJECTED))
+            count, sigmas = found.points.count, found.points.rows("velocity_sigma")
+            sigma = np.concatenate([each[np.isfinite(each).all(axis=1)] for each in sigmas])
+            told_sigmas = {
+                "velocity_sigma_m_s_median": np.median(sigma, axis=0).tolist() if len(sigma) else None,
+                "tracks_without_uncertainty_share": (count - len(sigma)) / count if count else None,
+            }
+            return Outcome(found.summary | told_sigmas, qualities, rejected)
 
     def summary(self, worked: Worked[Outcome]) -> dict[str, Any]:
         """Return what is told of the batch: all figures of a single result, the sums of several."""
@@ -250,7 +262,12 @@ def summary_of(worked: Worked[Outcome], paths: Sequence[Path]) -> dict[str, Any]
     """Return what is told of so many files of tracks."""
     outcomes = list(worked.outcomes.values())
     if len(paths) == 1:
-        told = outcomes[0].figures if outcomes else {"tracks": count_tracks(paths[0]) if paths[0].exists() else 0}
+        told = outcomes[0].figures if outcomes else {"tracks": 0}
+        if not outcomes and paths[0].exists():
+            # Of two frames, or of a sequence, which has a place for each frame of a track.
+            points = read_tracks(paths[0])
+            number = points.arrays.get("track")
+            told = {"tracks": len(points.position_mm) if number is None else len(np.unique(number))}
     else:
         tracks = sum(outcome.figures["tracks"] for outcome in outcomes)
         told = {"pairs": len(paths), "skipped": worked.skipped, "tracks": tracks}
@@ -260,13 +277,6 @@ def summary_of(worked: Worked[Outcome], paths: Sequence[Path]) -> dict[str, Any]
     every = quality_of_all(qualities)
     rejected = sum(outcome.rejected for outcome in outcomes)
     return told | {"vectors": every.vectors, "rejected": rejected} | every.summary()
-
-
-def count_tracks(path: Path) -> int:
-    """Return how many tracks a file holds, of two frames or of a sequence."""
-    points = read_tracks(path)
-    number = points.arrays.get("track")
-    return len(points.position_mm) if number is None else len(np.unique(number))
 
 
 def grid_paths(output: Path, intervals: int) -> list[Path]:
@@ -298,34 +308,3 @@ def _tracks(
     frames, reference = SeenFrames(len(paths), lambda number: read(paths[number])), read(paths[0]).reference
     with stored_tracks(frames, reference, settings, chosen, made, folder) as found:
         yield found
-
-
-def _sigmas(tracks: PointRows) -> dict[str, Any]:
-    """Return the median of the tracks' standard deviations, and the share of those without one."""
-    known = [sigma[np.isfinite(sigma).all(axis=1)] for sigma in tracks.rows("velocity_sigma")]
-    sigma = np.concatenate(known)
-    return {
-        "velocity_sigma_m_s_median": np.median(sigma, axis=0).tolist() if len(sigma) else None,
-        "tracks_without_uncertainty_share": (tracks.count - len(sigma)) / tracks.count if tracks.count else None,
-    }
-
-
-def _fitted(found: TracksOf[Any], name: str) -> Iterator[VectorField]:
-    """Yield the vectors of a field fitted to the tracks of each interval."""
-    return (each.vectors() for each in fields_of(found, name))
-
-
-def _write_grids(
-    grids: Sequence[Path], fields: Iterable[VectorField], tracks: PointRows, overwrite: bool, console: Console
-) -> tuple[list[Quality], int]:
-    """Write the vectors of each interval; return how good they are, and how many are rejected."""
-    qualities, rejected = [], 0
-    for target, field in zip(grids, fields if grids else (), strict=True):
-        quality = quality_of(field)
-        notices = list(field_notices(quality, target.name))
-        console.warn(notices)
-        made = with_warnings(tracks.provenance, notices)
-        vtkhdf.write_vectors(target, field, tracks.reference, provenance=made, overwrite=overwrite)
-        qualities.append(quality)
-        rejected += int(np.count_nonzero(field.flag >= REJECTED))
-    return qualities, rejected

@@ -21,11 +21,9 @@ from lfpiv_cli.scale import Scale
 from lfpiv_cli.tracks.candidates import Light, Seen, Trajectories, long_ones
 from lfpiv_cli.tracks.in_time import Scatter
 from lfpiv_cli.tracks.sequences import SHORTEST, follow, scatter_in, states_at
-from lfpiv_cli.tracks.tracking import SEARCH_LENSES, Tracks, wrong_link_variance
+from lfpiv_cli.tracks.tracking import SEARCH_LENSES, wrong_link_variance
 from lfpiv_cli.tracks.tracking import track as match
 from lfpiv_cli.verbs.checks import few_notices
-
-# The tracks of a sequence, a frame at a time: their states at each frame, and half-way between two.
 
 
 @dataclass(frozen=True, eq=False)
@@ -317,42 +315,35 @@ def tracked(
 ) -> Tracked:
     """Follow particles from frame to frame; where a sequence has been followed already, `found` says how."""
     reference, told = frames[0].reference, chosen.attributes(frames[0].reference)
-    paths: Sequence[Paths]
-    if chosen.shortest is None:
-        position, arrays, summary, paths = _pair(frames[0], frames[1], chosen)
-        name = TRACKS_FORMAT
-    else:
+    if chosen.shortest is not None:
         sequence = tracks_through([seen_in(frame) for frame in frames], chosen, found)
         arrays, summary, paths = sequence.by_track(), sequence.summary(), sequence.paths
-        position, name = arrays.pop(POSITION), TRAJECTORIES_FORMAT
-    return Tracked(Points(position, arrays, reference, told, provenance), name, paths, summary, settings)
-
-
-Found = tuple[NDArray[np.float64], dict[str, NDArray[Any]], dict[str, Any], list[Paths]]
-
-
-def _pair(first: Points, second: Points, chosen: Tracking) -> Found:
-    """Return places, arrays, summary and paths of particles followed from one frame to the next."""
-    found = match(seen_in(first), seen_in(second), chosen.search_mm, chosen.scale)
-    covariance = _covariance(first, second, found, chosen.scale)
-    start, end = first.position_mm[found.first], second.position_mm[found.second]
-    paths = Paths(0.5 * (start + end), end - start, np.sqrt(covariance[:, :3]))
+        points = Points(arrays.pop(POSITION), arrays, reference, told, provenance)
+        return Tracked(points, TRAJECTORIES_FORMAT, paths, summary, settings)
+    first, second = frames
+    links = match(seen_in(first), seen_in(second), chosen.search_mm, chosen.scale)
+    # (n, 6) of displacements, mm^2: xx, yy, zz, xy, yz, xz.
+    covariance = first.arrays["covariance_mm2"][links.first] + second.arrays["covariance_mm2"][links.second]
+    covariance[:, :3] += wrong_link_variance(links.probability, chosen.scale)
+    start, end = first.position_mm[links.first], second.position_mm[links.second]
+    path = Paths(0.5 * (start + end), end - start, np.sqrt(covariance[:, :3]))
     arrays = {
-        "velocity": paths.displacement_mm * MM_TO_M / chosen.dt_s,
-        "velocity_sigma": paths.sigma_mm * MM_TO_M / chosen.dt_s,
-        "displacement_mm": paths.displacement_mm,
+        "velocity": path.displacement_mm * MM_TO_M / chosen.dt_s,
+        "velocity_sigma": path.sigma_mm * MM_TO_M / chosen.dt_s,
+        "displacement_mm": path.displacement_mm,
         "displacement_covariance_mm2": covariance,
-        "particle_a": found.first,
-        "particle_b": found.second,
-        "link_probability": found.probability,
+        "particle_a": links.first,
+        "particle_b": links.second,
+        "link_probability": links.probability,
     }
     summary = {
         "particles_a": len(first.position_mm),
         "particles_b": len(second.position_mm),
-        "tracks": len(found.first),
-        "expected_wrong_links": float(np.sum(1.0 - found.probability)),
+        "tracks": len(links.first),
+        "expected_wrong_links": float(np.sum(1.0 - links.probability)),
     }
-    return paths.middle_mm, arrays, summary, [paths]
+    points = Points(path.middle_mm, arrays, reference, told, provenance)
+    return Tracked(points, TRACKS_FORMAT, [path], summary, settings)
 
 
 def tracks_through(frames: Sequence[Seen], chosen: Tracking, found: Trajectories | None) -> SequenceTracks:
@@ -375,10 +366,3 @@ def seen_in(frame: Points) -> Seen:
     """Return the particles of a file as tracking takes them."""
     light = Light(frame.arrays["intensity"], frame.arrays.get("intensity_sigma"))
     return Seen(frame.position_mm, frame.arrays["covariance_mm2"], light)
-
-
-def _covariance(first: Points, second: Points, tracks: Tracks, scale: Scale) -> NDArray[np.float64]:
-    """Return the covariances (n, 6) of a pair's displacements, mm^2: xx, yy, zz, xy, yz, xz."""
-    covariance = first.arrays["covariance_mm2"][tracks.first] + second.arrays["covariance_mm2"][tracks.second]
-    covariance[:, :3] += wrong_link_variance(tracks.probability, scale)
-    return np.asarray(covariance)

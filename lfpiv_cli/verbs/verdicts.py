@@ -6,12 +6,11 @@ warned of when files were made counts, and for vectors what the flow says agains
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lfpiv_cli.calibration.light_checks import MOST_SATURATED
 from lfpiv_cli.flow.field import MASKED, REJECTED, VectorField, difference_over_stated, divergence_over_stated
@@ -85,34 +84,22 @@ def of_warnings(records: Mapping[str, Mapping[str, Any]]) -> list[Reason]:
     """Return what the warnings say that the records of files hold, by the files' names; each once, with its count."""
     seen: dict[tuple[Part, str], list[tuple[str, Mapping[str, Any]]]] = {}
     for name, made in records.items():
+        verb = verb_of(made)
+        part: Part = "calibration" if verb in OF_CALIBRATION else "images" if verb in OF_IMAGES else "vectors"
         for warning in made.get("warnings", ()):
-            seen.setdefault((_part_of(verb_of(made)), warning["code"]), []).append((name, warning))
-    return [
-        Reason(part, _worst_of(warnings), _told(warnings, len({name for name, _ in those})))
-        for (part, _), those in seen.items()
-        if (warnings := [warning for _, warning in those])
-    ]
-
-
-def _told(warnings: Sequence[Mapping[str, Any]], files: int) -> str:
-    first = warnings[0]
-    more = f" (and {files - 1} more)" if files > 1 else ""
-    return f"{first['about']}: {first['text']}{more}; {first['remedy']}"
+            seen.setdefault((part, warning["code"]), []).append((name, warning))
+    reasons = []
+    for (part, _), those in seen.items():
+        first, files = those[0][1], len({name for name, _ in those})
+        more = f" (and {files - 1} more)" if files > 1 else ""
+        word = max((word_of(warning) for _, warning in those), key=WORDS.index)
+        reasons.append(Reason(part, word, f"{first['about']}: {first['text']}{more}; {first['remedy']}"))
+    return reasons
 
 
 def verb_of(made: Mapping[str, Any]) -> str:
     """Return the command of a record without its options."""
     return str(made.get("command")).split(" ")[0]
-
-
-def _part_of(verb: str) -> Part:
-    if verb in OF_CALIBRATION:
-        return "calibration"
-    return "images" if verb in OF_IMAGES else "vectors"
-
-
-def _worst_of(warnings: Iterable[Mapping[str, Any]]) -> Word:
-    return max((word_of(each) for each in warnings), key=WORDS.index)
 
 
 def word_of(warning: Mapping[str, Any]) -> Word:
@@ -136,7 +123,18 @@ def of_vectors(field: VectorField, name: str) -> list[Reason]:
             text = f"{name}: most displacements are within {SHORTEST_SIGMAS:g} standard deviations of zero"
             reasons.append(Reason("vectors", "look", f"{text}; a longer time between the images would show the flow"))
         else:
-            reasons += _components(field, there, field.uncertainty_voxel[there], name)
+            # Components that are known too badly to tell much of the flow.
+            usual_mm = float(np.median(np.linalg.norm(field.displacement_voxel[there] * field.voxel_mm, axis=1)))
+            sigma_voxel = field.uncertainty_voxel[there]
+            known = sigma_voxel[np.isfinite(sigma_voxel).all(axis=1)]
+            sigma_mm = np.median(known, axis=0) * field.voxel_mm if len(known) else np.zeros(3)
+            for component, sigma in zip("uvw", sigma_mm, strict=True):
+                if sigma > LARGEST_SHARE * usual_mm > 0.0:
+                    text = (
+                        f"{name}: {component} is known to {written(sigma, 2)} mm, {sigma / usual_mm:.0%} of the usual "
+                        "displacement; particles in place of volumes, or a longer time between the images, tell more"
+                    )
+                    reasons.append(Reason("vectors", "look", text))
     ratio = divergence_over_stated(field)
     if ratio is not None and ratio > LARGEST_OVER_STATED:
         text = f"{name}: the divergence is {ratio:.1f} times what the stated errors make, and a liquid has none"
@@ -144,27 +142,6 @@ def of_vectors(field: VectorField, name: str) -> list[Reason]:
             Reason("vectors", "look", f"{text}: errors are larger than stated, or the flow finer than windows")
         )
     return reasons
-
-
-def _components(
-    field: VectorField, there: NDArray[np.bool_], sigma_voxel: NDArray[np.float64], name: str
-) -> list[Reason]:
-    """Return which components are known too badly to tell much of the flow."""
-    usual_mm = float(np.median(np.linalg.norm(field.displacement_voxel[there] * field.voxel_mm, axis=1)))
-    known = sigma_voxel[np.isfinite(sigma_voxel).all(axis=1)]
-    if not len(known):
-        return []
-    sigma_mm = np.median(known, axis=0) * field.voxel_mm
-    return [
-        Reason(
-            "vectors",
-            "look",
-            f"{name}: {component} is known to {written(sigma, 2)} mm, {sigma / usual_mm:.0%} of the usual "
-            "displacement; particles in place of volumes, or a longer time between the images, tell more",
-        )
-        for component, sigma in zip("uvw", sigma_mm, strict=True)
-        if sigma > LARGEST_SHARE * usual_mm > 0.0
-    ]
 
 
 def of_two_ways(one: VectorField, other: VectorField, names: tuple[str, str]) -> list[Reason]:

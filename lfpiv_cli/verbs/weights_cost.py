@@ -71,36 +71,22 @@ def rig_notices(
         return [*notices, *_of_sines(camera, source.media, seen_depths_mm(camera, source, grid))]
     if not isinstance(source, ObjectSpace):
         return notices
-    return [
-        *notices,
-        *_of_refraction(settings, found, camera, source, depths),
-        *_of_sines(camera, source.media, depths),
-    ]
-
-
-def _of_refraction(
-    settings: Config, found: Calibration | None, camera: Camera, source: ObjectSpace, depths: NDArray[np.float64]
-) -> Iterator[Notice]:
-    if source.refraction == "exact" or source.media == source.media.in_air():
-        return
-    try:
-        window = settings.window_model(found.mid_plane_z_mm if found else None)
-    except ConfigError:
-        window = None
-    error_px = refraction_error_mm(camera, source.media, window, depths) / camera.pixel_mm
-    if error_px <= LARGEST_ERROR_PX:
-        return
-    least = "" if window else "at least "
-    remedy = "--refraction exact" if window else "give the section window, or channel, and --refraction exact"
-    yield Notice(
-        "paraxial-refraction",
-        "weights.refraction",
-        f"is paraxial, and Snell's law moves light at the rim of the aperture by {least}{written(error_px, 2)} px on "
-        f"the array, at most {LARGEST_ERROR_PX:g} px without harm",
-        remedy,
-        error_px,
-        f"at most {LARGEST_ERROR_PX:g} px",
-    )
+    if source.refraction != "exact" and source.media != source.media.in_air():
+        try:
+            window = settings.window_model(found.mid_plane_z_mm if found else None)
+        except ConfigError:
+            window = None
+        error_px = refraction_error_mm(camera, source.media, window, depths) / camera.pixel_mm
+        if error_px > LARGEST_ERROR_PX:
+            text = (
+                "is paraxial, and Snell's law moves light at the rim of the aperture by "
+                f"{'' if window else 'at least '}{written(error_px, 2)} px on the array, at most "
+                f"{LARGEST_ERROR_PX:g} px without harm"
+            )
+            remedy = "--refraction exact" if window else "give the section window, or channel, and --refraction exact"
+            limit = f"at most {LARGEST_ERROR_PX:g} px"
+            notices.append(Notice("paraxial-refraction", "weights.refraction", text, remedy, error_px, limit))
+    return [*notices, *_of_sines(camera, source.media, depths)]
 
 
 def _of_sines(camera: Camera, media: Media, depths: NDArray[np.float64]) -> Iterator[Notice]:
@@ -246,14 +232,6 @@ def held_bytes(voxels: int, pixels: int) -> float:
 def columns_bytes(voxels: int) -> float:
     """Return what columns take in memory that are made on demand, at most."""
     return float(min(voxels * COLUMN_BYTES, LARGEST_BYTES))
-
-
-def on_demand_told(voxels: int) -> str:
-    """Return what volumes will take whose columns are made on demand, in words."""
-    return (
-        f"columns are made on demand: up to {written(voxels * COLUMN_S / 60.0, 2)} minutes of a core for each image, "
-        f"where all {written(voxels)} voxels can be lit"
-    )
 
 
 def check_rays(settings: Config, source: Source, grid: Grid) -> None:
