@@ -27,7 +27,6 @@ from lfpiv_cli.paper.pictures import (
     location_figure,
     views_figure,
 )
-from lfpiv_cli.stages.validate_board import BoardBench, BoardSolver, bench_of, board_solver, placement_of
 from lfpiv_cli.synthetic.board import dot_centres
 from lfpiv_cli.validation.board import (
     DEPTH_DEFINITIONS,
@@ -39,6 +38,7 @@ from lfpiv_cli.validation.board import (
     board_figures,
     measure_dots,
 )
+from lfpiv_cli.verbs.validate_board import BoardBench, BoardSolver, bench_of, board_solver, placement_of
 
 Half = Literal["ideal", "recorded"]
 Figures = dict[str, dict[str, Any]]

@@ -19,7 +19,6 @@ if TYPE_CHECKING:
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.files import calibration_file, vtkhdf, weights_file
@@ -37,7 +36,6 @@ from lfpiv_cli.files.particle_file import (
     read_points,
 )
 from lfpiv_cli.files.weights_file import FORMAT, WeightsFile, open_weights
-from lfpiv_cli.flow.field import VectorField
 from lfpiv_cli.notice import written
 from lfpiv_cli.pictures import calibration as of_calibration
 from lfpiv_cli.pictures import points as of_particles
@@ -96,7 +94,11 @@ def _of_vectors(path: Path) -> dict[str, Drawn]:
         "Where vectors are valid, taken from a second peak, replaced by their neighbours, rejected or masked.",
         partial(of_vectors.flags_figure, field),
     )
-    qualities = _qualities(path, field)
+    # Not what is alike everywhere.
+    with open_h5(path) as file:
+        known = {QUALITIES[name]: np.asarray(member(file, name)) for name in QUALITIES if name in file}
+    reshaped = {words: values.reshape(field.flag.shape) for words, values in known.items()}
+    qualities = {words: each for words, each in reshaped.items() if np.unique(each[np.isfinite(each)]).size > 1}
     if qualities:
         figures["quality"] = Drawn(
             f"What else tells how good vectors are: {', '.join(qualities)}.",
@@ -126,17 +128,6 @@ def _lens_mm(path: Path) -> float | None:
         return config.camera_model().scale(config.media_model()).lens_mm
     except (InputError, ConfigError):
         return None
-
-
-def _qualities(path: Path, field: VectorField) -> dict[str, NDArray[np.float64]]:
-    """Return what the file knows of the vectors' quality, by the words for it; not what is alike everywhere."""
-    with open_h5(path) as file:
-        found: dict[str, NDArray[Any]] = {
-            words: np.asarray(member(file, name)).reshape(field.flag.shape)
-            for name, words in QUALITIES.items()
-            if name in file
-        }
-    return {words: values for words, values in found.items() if np.unique(values[np.isfinite(values)]).size > 1}
 
 
 def _of_particles(path: Path, raw: Path | None) -> dict[str, Drawn]:
@@ -368,7 +359,10 @@ def plot(
     if unknown:
         raise UsageError(f"--only {unknown[0]}: {file} has the figures {', '.join(figures)}")
     chosen = {name: drawn for name, drawn in figures.items() if not options.only or name in options.only}
-    targets = _targets(output, list(chosen))
+    # A PDF holds all, a PNG one; of several each has its name at the end.
+    targets = dict.fromkeys(chosen, output)
+    if output.suffix != ".pdf" and len(chosen) > 1:
+        targets = {name: output.with_name(f"{output.stem}_{name}{output.suffix}") for name in chosen}
     for target in targets.values():
         ensure_writable(target, overwrite, given(file=file, raw=options.raw).values())
     with console.progress(len(chosen), "figures") as advance:
@@ -379,13 +373,6 @@ def plot(
             for target, figure in zip(targets.values(), drawn, strict=True):
                 write_picture(target, figure, overwrite)
     return {"figures": list(chosen), "files": [str(target) for target in dict.fromkeys(targets.values())]}
-
-
-def _targets(output: Path, names: list[str]) -> dict[str, Path]:
-    """Return where each figure goes: a PDF holds all, a PNG one; of several each has its name at the end."""
-    if output.suffix == ".pdf" or len(names) == 1:
-        return dict.fromkeys(names, output)
-    return {name: output.with_name(f"{output.stem}_{name}{output.suffix}") for name in names}
 
 
 def _drawn(figures: Mapping[str, Drawn], advance: Callable[[int], None]) -> Iterator[Figure]:

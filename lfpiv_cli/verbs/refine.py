@@ -148,7 +148,14 @@ def _scene(
             advance,
         )
     if not found.agree:
-        console.warn([disagreement_notice(found)])
+        apart = np.abs(found.by_wall - found.nuisances.scene)[:2].max()
+        text = (
+            f"the tracers' images tell of a pipe whose axis lies {apart:.3f} mm beside that of the wall they end at, "
+            "more than chance explains; the wall is believed"
+        )
+        remedy = "check radii and refractive indices of the scene"
+        expected = f"at most {AGREEING_CHI2:g}"
+        console.warn([Notice("scene-contradicts", "scene", text, remedy, found.disagreement, expected)])
 
     def draw() -> Figure:
         from lfpiv_cli.pictures.walls import round_wall_figure
@@ -156,14 +163,3 @@ def _scene(
         return round_wall_figure(found)
 
     return Refined(found, found.applied(before, told.scene_fingerprint()), draw)
-
-
-def disagreement_notice(found: SceneRefinement) -> Notice:
-    """Return that the images of the tracers tell of another scene than the wall that they end at."""
-    apart = np.abs(found.by_wall - found.nuisances.scene)[:2].max()
-    text = (
-        f"the tracers' images tell of a pipe whose axis lies {apart:.3f} mm beside that of the wall they end at, more "
-        "than chance explains; the wall is believed"
-    )
-    remedy = "check radii and refractive indices of the scene"
-    return Notice("scene-contradicts", "scene", text, remedy, found.disagreement, f"at most {AGREEING_CHI2:g}")

@@ -18,15 +18,12 @@ from lfpiv_cli.files.inputs import given
 from lfpiv_cli.files.pages import ensure_drawing, write_picture
 from lfpiv_cli.files.particles import MM_PER_M, read_particles
 from lfpiv_cli.files.provenance import record
-from lfpiv_cli.files.provenance import record as provenance_record
 from lfpiv_cli.files.sections_simulated import FlowSection
 from lfpiv_cli.flow.field import VectorField
 from lfpiv_cli.flow.windows import RoundWall
 from lfpiv_cli.names import Moment
 from lfpiv_cli.notice import Notice
 from lfpiv_cli.optics.tracing import ObjectSpace
-from lfpiv_cli.reference import Reference
-from lfpiv_cli.stages.validate_board import depths_in_volume, validate_board
 from lfpiv_cli.synthetic.vortices import Flow
 from lfpiv_cli.validation.flow import Duct, limits_missed, truth_at_points
 from lfpiv_cli.validation.methods import (
@@ -53,14 +50,12 @@ from lfpiv_cli.validation.weights import (
     weights_figures,
     weights_limits_missed,
 )
-from lfpiv_cli.verbs.chain import run_chain
+from lfpiv_cli.verbs.chain import measure_images, simulate_images
 from lfpiv_cli.verbs.simulate import ensure_experiment
+from lfpiv_cli.verbs.validate_board import depths_in_volume, validate_board
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-
-# The stage of `validate volume`: a reconstructed volume against the particles that were there.
 
 
 # When the frames of a pair are taken, in units of the time between them, counted from the middle of the pair.
@@ -121,7 +116,11 @@ def validate_weights(
         with console.progress(len(voxels), "validate weights") as advance:
             columns = make_curved_columns(camera, scene, grid, voxels, rng, long_count, advance)
     else:
-        space = _space(settings)
+        try:
+            window = settings.window_model()
+        except ConfigError:
+            window = None  # there is nothing to trace directly
+        space = ObjectSpace(settings.media_model(), window)
         known = [centre for centre in TABLE1_MM if in_view(camera, space, centre, grid.spacing_mm)]
         centres = np.concatenate([np.array(known).reshape(-1, 3), sample_voxels(grid, chosen.sample, rng)])
         long_count = np.where(np.arange(len(centres)) < len(known), chosen.long_count_rays, 0)
@@ -129,8 +128,8 @@ def validate_weights(
             columns = make_columns(camera, space, centres, grid.spacing_mm, rng, long_count, advance)
     figures = weights_figures(columns, long_count)
     missed = weights_limits_missed(figures, chosen.limits.model_dump())
-    record = provenance_record("validate weights", settings.resolved(), {"config": config})
-    write_json(paths[".json"], {"figures": figures, "limits_missed": missed, "provenance": record}, overwrite)
+    provenance = record("validate weights", settings.resolved(), {"config": config})
+    write_json(paths[".json"], {"figures": figures, "limits_missed": missed, "provenance": provenance}, overwrite)
     shown = min(len(TABLE1_MM), len(columns))
     names = SHOWN if scene is None else SHOWN_BEHIND_FACES
     write_picture(paths["_columns.png"], columns_figure(columns[:shown], names), overwrite)
@@ -144,15 +143,6 @@ def validate_weights(
     if missed:
         raise LimitMissedError(f"{paths['.json']}: {'; '.join(missed)}", summary)
     return {"voxels": len(columns)} | summary
-
-
-def _space(settings: Config) -> ObjectSpace:
-    """Return media and window; without the section `window` there is nothing to trace directly."""
-    try:
-        window = settings.window_model()
-    except ConfigError:
-        window = None
-    return ObjectSpace(settings.media_model(), window)
 
 
 PICTURES: dict[str, Callable[[Mapping[str, Measured]], Figure]] = {
@@ -198,7 +188,12 @@ def validate_flow(
     for target in paths.values():
         ensure_writable(target, overwrite, given(config=config, vectors=vectors, particles=particles).values())
     ensure_drawing()
-    made = {"measured": vectors} if vectors else run_chain(config, output, overwrite=overwrite, console=console)
+    if vectors:
+        made = {"measured": vectors}
+    else:
+        # With all imperfections on, which every method gets alike; of a longer sequence the first two images.
+        simulate_images(config, output / "images", overwrite=overwrite, console=console)
+        made = measure_images(config, output / "images", output, overwrite=overwrite, console=console)
     inputs = given(config=config, particles=particles) | (given(vectors=vectors) if vectors else made)
     methods = {name: measured_of(path, settings, particles, is_simulated) for name, path in made.items()}
     if particles and named is not None and methods["measured"].flow is None:
@@ -249,7 +244,17 @@ def measured_of(vectors: Path, settings: Config, particles: Path | None, is_simu
     if field.dt_s is None:
         raise InputError(f"{vectors}: holds displacements without a time; correlate again with --dt-s")
     if particles:
-        return _beside_particles(field, vtkhdf.read_header(vectors).reference, settings, particles)
+        # Judged where there are particles, with the config's flow if these follow it, else with theirs.
+        reference = vtkhdf.read_header(vectors).reference
+        truth, inside = _truth_of_particles(particles, reference.points_to_focal_point(field.grid.centres_mm()))
+        if settings.validation.flow is None and settings.simulation.flow is None:
+            return Measured(field, truth, inside)
+        flow, true = settings.true_flow(), read_particles(particles)
+        difference = flow(reference.points_from_focal_point(true.positions_mm)) - true.velocities_m_s
+        if np.linalg.norm(difference) > SAME_FLOW * np.linalg.norm(true.velocities_m_s):
+            return Measured(field, truth, inside)
+        analytic = _at_windows(flow, field)
+        return Measured(field, analytic, inside & analytic.any(axis=-1), flow)
     flow = settings.simulated_flow() if is_simulated else settings.true_flow()
     truth = _at_windows(flow, field)
     return Measured(field, truth, np.asarray(truth.any(axis=-1)), flow)
@@ -258,20 +263,6 @@ def measured_of(vectors: Path, settings: Config, particles: Path | None, is_simu
 def _at_windows(flow: Flow, field: VectorField) -> NDArray[np.float64]:
     centres = field.grid.centres_mm()
     return flow(centres.reshape(-1, 3)).reshape(centres.shape)
-
-
-def _beside_particles(field: VectorField, reference: Reference, settings: Config, particles: Path) -> Measured:
-    """Return vectors, judged where there are particles, with the config's flow if these follow it, else with theirs."""
-    centres = reference.points_to_focal_point(field.grid.centres_mm())
-    truth, inside = _truth_of_particles(particles, centres)
-    if settings.validation.flow is None and settings.simulation.flow is None:
-        return Measured(field, truth, inside)
-    flow, true = settings.true_flow(), read_particles(particles)
-    difference = flow(reference.points_from_focal_point(true.positions_mm)) - true.velocities_m_s
-    if np.linalg.norm(difference) > SAME_FLOW * np.linalg.norm(true.velocities_m_s):
-        return Measured(field, truth, inside)
-    analytic = _at_windows(flow, field)
-    return Measured(field, analytic, inside & analytic.any(axis=-1), flow)
 
 
 def _other_flow(config: Path, particles: Path) -> Notice:

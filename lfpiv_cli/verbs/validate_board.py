@@ -22,13 +22,11 @@ from lfpiv_cli.files.pages import ensure_drawing, write_picture
 from lfpiv_cli.files.provenance import record
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.tracing import ObjectSpace
-from lfpiv_cli.optics.waves import Waves
 from lfpiv_cli.reconstruction.equations import normalisers
 from lfpiv_cli.reconstruction.images import Image, Mask, light
 from lfpiv_cli.reconstruction.solvers import ALL_ITERATIONS, Reconstruction, reconstruct
 from lfpiv_cli.synthetic.board import BoardPlacement, dot_centres, render_board
-from lfpiv_cli.synthetic.scenes import Misalignment, RecordingCamera, simulate_board, simulate_white
-from lfpiv_cli.synthetic.sensor import Readout
+from lfpiv_cli.synthetic.scenes import RecordingCamera, simulate_board, simulate_white
 from lfpiv_cli.validation.board import (
     DEPTHS_MM,
     PAPER,
@@ -82,65 +80,6 @@ class BoardBench:
         rays = fit_rays(pictures, depths_mm, self.rig.camera, self.rig.board, self.rig.media).rays
         operator = operator_of(self.rig.camera, rays, self.weights.grid)
         return replace(self, weights=replace(self.weights, solver_operator=operator, scene_distortion_per_mm2=None))
-
-
-def ideal_bench(rig: Rig, grid: Grid, level: float, rng: np.random.Generator) -> BoardBench:
-    """Return the data sheet's camera, `level` expected counts in a pixel that sees only what is bright."""
-    space = ObjectSpace(rig.media, None, "paraxial")
-    weights = Weights(grid, (0, 0, 0), factorise_through(rig.camera, space, grid), rig.camera.column_axis)
-
-    def picture(placement: BoardPlacement) -> Image:
-        return render_board(rig.camera, space, rig.board, placement, level, rng).astype(np.float32)
-
-    return BoardBench(rig, weights, picture, np.zeros(weights.image_shape, np.bool_))
-
-
-@dataclass(frozen=True)
-class Reality:
-    """How a real bench is other than its data sheets say.
-
-    Attributes
-    ----------
-    misalignment : of the camera
-    readout : of its sensor, with noise
-    space : what lies before the lens
-    waves : what light is made of; rays where there are none
-    """
-
-    misalignment: Misalignment
-    readout: Readout
-    space: ObjectSpace
-    waves: Waves | None = None
-
-
-def recorded_bench(
-    rig: Rig, assumed: ObjectSpace, reality: Reality, grid: Grid, level: float, rng: np.random.Generator
-) -> BoardBench:
-    """Return a camera that departs from its data sheet, calibrated from pictures that it took.
-
-    Parameters
-    ----------
-    rig : as the data sheets have it
-    assumed : what is taken to lie before the lens, for the weights
-    level : expected counts in a pixel that sees only what is bright
-    """
-    real = RecordingCamera(reality.misalignment.apply(rig.camera), reality.readout, reality.waves)
-    dark = real.dark_frame(rng)
-    white = simulate_white(real, level, rng).image
-    board = replace(rig.board, medium="air")
-    air = ObjectSpace(rig.media.in_air(), None, "paraxial")
-    snapshot = simulate_board(real, air, board, BoardPlacement(CALIBRATION_BOARD_Z_MM), level, rng).image
-    calibration = calibrate(Photographs([white], dark, snapshot), replace(rig, board=board))
-    camera = calibration.camera(rig.camera)
-    bend = scene_distortion(camera, rig.media, grid)
-    operator = factorise_through(camera, assumed, grid)
-    weights = Weights(grid, (0, 0, 0), operator, camera.column_axis, calibration, bend)
-
-    def picture(placement: BoardPlacement) -> Image:
-        recorded = simulate_board(real, reality.space, rig.board, placement, level, rng).image
-        return weights.prepare(light(recorded.astype(np.float32), dark.astype(np.float32)))
-
-    return BoardBench(replace(rig, camera=camera), weights, picture, ~calibration.rectification.inside)
 
 
 BoardSolver = Callable[[NDArray[np.float32], Callable[[int], None]], Reconstruction]
@@ -217,15 +156,39 @@ def placement_of(settings: Config, depth_mm: float) -> BoardPlacement:
 
 
 def bench_of(settings: Config, half: str) -> BoardBench:
-    """Return the camera before which the boards of a half of Table 3 are held."""
-    scene = settings.simulation
+    """Return the camera before which the boards of a half of Table 3 are held.
+
+    The ideal one is the data sheet's; the other one departs from it, and is calibrated from pictures that it took.
+    """
+    scene, level = settings.simulation, settings.simulation.peak_counts
     settings.ensure_plane_layers("validating boards")
     rig, grid, rng = settings.rig(), settings.grid(), np.random.default_rng(scene.seed)
     if half == "ideal":
-        return ideal_bench(rig, grid, scene.peak_counts, rng)
-    true = ObjectSpace(rig.media, settings.window_model(), scene.refraction)
-    reality = Reality(misalignment_of(settings), readout_of(settings), true, waves_of(scene.light))
-    return recorded_bench(rig, settings.plane_space("validating boards"), reality, grid, scene.peak_counts, rng)
+        paraxial = ObjectSpace(rig.media, None, "paraxial")
+        weights = Weights(grid, (0, 0, 0), factorise_through(rig.camera, paraxial, grid), rig.camera.column_axis)
+
+        def ideal_picture(placement: BoardPlacement) -> Image:
+            return render_board(rig.camera, paraxial, rig.board, placement, level, rng).astype(np.float32)
+
+        return BoardBench(rig, weights, ideal_picture, np.zeros(weights.image_shape, np.bool_))
+    space = ObjectSpace(rig.media, settings.window_model(), scene.refraction)
+    assumed = settings.plane_space("validating boards")
+    real = RecordingCamera(misalignment_of(settings).apply(rig.camera), readout_of(settings), waves_of(scene.light))
+    dark = real.dark_frame(rng)
+    white = simulate_white(real, level, rng).image
+    board = replace(rig.board, medium="air")
+    air = ObjectSpace(rig.media.in_air(), None, "paraxial")
+    snapshot = simulate_board(real, air, board, BoardPlacement(CALIBRATION_BOARD_Z_MM), level, rng).image
+    calibration = calibrate(Photographs([white], dark, snapshot), replace(rig, board=board))
+    camera = calibration.camera(rig.camera)
+    bend, operator = scene_distortion(camera, rig.media, grid), factorise_through(camera, assumed, grid)
+    calibrated = Weights(grid, (0, 0, 0), operator, camera.column_axis, calibration, bend)
+
+    def picture(placement: BoardPlacement) -> Image:
+        recorded = simulate_board(real, space, rig.board, placement, level, rng).image
+        return calibrated.prepare(light(recorded.astype(np.float32), dark.astype(np.float32)))
+
+    return BoardBench(replace(rig, camera=camera), calibrated, picture, ~calibration.rectification.inside)
 
 
 def _discs(
