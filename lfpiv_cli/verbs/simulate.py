@@ -36,7 +36,7 @@ from lfpiv_cli.optics.tracing import ObjectSpace
 from lfpiv_cli.reference import FOCAL_POINT, Reference
 from lfpiv_cli.synthetic import scenes
 from lfpiv_cli.synthetic.board import BoardPlacement, points_of
-from lfpiv_cli.synthetic.bubbles import bubbles_at_wall, render_bubbles
+from lfpiv_cli.synthetic.bubbles import Bubbles, bubbles_at_wall, render_bubbles
 from lfpiv_cli.synthetic.curved_rays import unseen
 from lfpiv_cli.synthetic.flows import STEADY, Pulsation
 from lfpiv_cli.synthetic.objective import objective_of
