@@ -39,8 +39,8 @@ from lfpiv_cli.flow.field import REJECTED, VectorField, derived_fields
 from lfpiv_cli.flow.peaks import with_locking
 from lfpiv_cli.flow.windows import inside
 from lfpiv_cli.grid import Grid
-from lfpiv_cli.notice import Notice, warn_of
-from lfpiv_cli.reference import FOCAL_POINT, Reference
+from lfpiv_cli.notice import warn_of
+from lfpiv_cli.reference import FOCAL_POINT
 from lfpiv_cli.verbs.batches import ALL, BatchOptions, Expected, Worked, dry_run, work_through
 from lfpiv_cli.verbs.checks import (
     Quality,
@@ -206,9 +206,8 @@ def correlate_files(
     *,
     overwrite: bool = False,
     console: Console = CONSOLE,
-    pairs: Pairs | None = None,
 ) -> dict[str, Any]:
-    """Measure the displacements between pairs of volumes; `pairs`, where they are known already.
+    """Measure the displacements between pairs of volumes.
 
     Of vectors and tracks that are there, in place of volumes, only the `mean` is made.
     """
@@ -227,7 +226,7 @@ def correlate_files(
     if options.watch:
         batch, worked = _as_they_come(volumes, output, options, overwrite, console)
         return worked.ensure_whole(batch.summary(worked), batch.unit)
-    batch = Correlation(volumes, output, options, overwrite, pairs)
+    batch = Correlation(volumes, output, options, overwrite)
     if options.dry_run:
         return dry_run(batch, options, console)
     worked = work_through(batch, options, console)
@@ -338,7 +337,28 @@ class Correlation(PairBatch[Outcome, CorrelateOptions]):
         """Correlate a pair, or all of them, and write the vectors."""
         target = self.targets[number]
         job = self._job(number)
-        field, reference, notices = _measure(job, self._options.mask_volume, work)
+        mask, (one, _) = self._options.mask_volume, job.pairs[0]
+        first, drawn = vtkhdf.open_volume(one), None if mask is None else vtkhdf.open_volume(mask)
+        if drawn is not None and drawn.grid != first.grid:
+            raise InputError(f"{mask}: its grid {drawn.grid} differs from that of {one}, {first.grid}")
+
+        def volumes() -> Iterator[tuple[NDArray[np.float32], NDArray[np.float32]]]:
+            for pair in job.pairs:
+                a, b = (first if path == one else vtkhdf.open_volume(path) for path in pair)
+                for path, volume in zip(pair, (a, b), strict=True):
+                    ensure_alike(first, volume, (str(one), str(path)))
+                yield a.array, b.array
+
+        usable = usable_voxels(job.settings, first.grid, None if drawn is None else drawn.array)
+        settings = job.settings.correlation_settings(first.grid.spacing_mm)
+        made = {f"{role} {path.name}": earlier_record(path) or {} for role, path in job.inputs().items()}
+        notices = [*calibration_notices(made), *window_notices(first, settings, one.name)]
+        share = 1.0 / count_passes(settings.windows)
+        field = measure(
+            volumes(), first.grid, settings, mask=usable, progress=lambda passes: work.advance(share * passes)
+        )
+        camera, media = job.settings.camera_model(), job.settings.media_model()
+        field = with_locking(field, first.reference, camera.scale(media))
         quality, name = quality_of(field), target.path.name
         records = ([self._record_of(path) for path in pair] for pair in job.pairs)
         notices += dt_notices(job.settings.correlation.dt_s, records, name)
@@ -348,7 +368,7 @@ class Correlation(PairBatch[Outcome, CorrelateOptions]):
         vtkhdf.write_vectors(
             target.path,
             field,
-            reference,
+            first.reference,
             provenance=with_warnings(target.record, notices),
             # What is complete is skipped: in the place of what is made there is nothing, or something broken.
             overwrite=self.overwrite or self._options.resume,
@@ -418,27 +438,3 @@ def summary_of(worked: Worked[Outcome], pairs: int) -> dict[str, Any]:
     }
     divergence = [outcome.divergence_rms for outcome in outcomes if outcome.divergence_rms is not None]
     return told | found.summary() | ({"divergence_rms_per_s": float(np.mean(divergence))} if divergence else {})
-
-
-def _measure(job: Job, mask: Path | None, work: Frames) -> tuple[VectorField, Reference, list[Notice]]:
-    """Return the vectors of a job, the origin of its volumes' coordinates, and what speaks against its windows."""
-    first = vtkhdf.open_volume(job.pairs[0][0])
-    drawn = None if mask is None else vtkhdf.open_volume(mask)
-    if drawn is not None and drawn.grid != first.grid:
-        raise InputError(f"{mask}: its grid {drawn.grid} differs from that of {job.pairs[0][0]}, {first.grid}")
-
-    def volumes() -> Iterator[tuple[NDArray[np.float32], NDArray[np.float32]]]:
-        for pair in job.pairs:
-            a, b = (first if path == job.pairs[0][0] else vtkhdf.open_volume(path) for path in pair)
-            for path, volume in zip(pair, (a, b), strict=True):
-                ensure_alike(first, volume, (str(job.pairs[0][0]), str(path)))
-            yield a.array, b.array
-
-    usable = usable_voxels(job.settings, first.grid, None if drawn is None else drawn.array)
-    settings = job.settings.correlation_settings(first.grid.spacing_mm)
-    records = {f"{role} {path.name}": earlier_record(path) or {} for role, path in job.inputs().items()}
-    notices = [*calibration_notices(records), *window_notices(first, settings, job.pairs[0][0].name)]
-    share = 1.0 / count_passes(settings.windows)
-    field = measure(volumes(), first.grid, settings, mask=usable, progress=lambda passes: work.advance(share * passes))
-    field = with_locking(field, first.reference, job.settings.camera_model().scale(job.settings.media_model()))
-    return field, first.reference, notices

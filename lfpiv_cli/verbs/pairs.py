@@ -300,17 +300,13 @@ class PairByPair(Batch[Made]):
     def __init__(
         self,
         found: Batch[Any],
-        of_pair: Callable[..., Batch[Made]],
-        given: Sequence[Any],
+        of_pair: Callable[[Sequence[Path], Path, Pairs, Mapping[Path, Gone]], Batch[Made]],
         pairs: Pairs,
         targets: Sequence[Target],
         file_bytes: float | None = None,
     ) -> None:
-        """Take the batch of the frames, the class of that of two of them and what it takes besides the files.
-
-        And where results go, and how large one is if that is known.
-        """
-        self._found, self._of_pair, self._given, self._pairs = found, of_pair, given, pairs.pairs
+        """Take the batch of the frames, what makes that of two of them, where results go, and how large one is."""
+        self._found, self._of_pair, self._pairs = found, of_pair, pairs.pairs
         self._file_bytes = file_bytes
         self.label, self.overwrite = found.label, found.overwrite
         self.targets = [replace(each, make_record=partial(self._record, k)) for k, each in enumerate(targets)]
@@ -403,4 +399,4 @@ class PairByPair(Batch[Made]):
     def _join(self, number: int, gone: Mapping[Path, Gone]) -> Batch[Made]:
         """Return the batch of one pair: of the files of its frames, of which some may be gone, into one file."""
         paths = [self._found.targets[k].path for k in self._pairs[number]]
-        return self._of_pair(paths, self.targets[number].path, *self._given, Pairs(((0, 1),)), gone)
+        return self._of_pair(paths, self.targets[number].path, Pairs(((0, 1),)), gone)

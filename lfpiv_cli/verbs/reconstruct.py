@@ -178,14 +178,8 @@ def reconstruct_files(
     *,
     overwrite: bool = False,
     console: Console = CONSOLE,
-    pairs: Pairs | None = None,
-    prepared: Prepared | None = None,
-    order: Sequence[int] | None = None,
 ) -> dict[str, Any]:
-    """Reconstruct the volume behind each image, or find its particles.
-
-    `pairs` and `prepared`, where these are known already; `order`, where only some frames are to be made.
-    """
+    """Reconstruct the volume behind each image, or find its particles."""
     if options.watch:
         settings = carried_config(read_weights_record(weights), weights).overridden_by("reconstruction", options)
         refused = None
@@ -203,7 +197,7 @@ def reconstruct_files(
                 lambda group: Reconstruction(weights, group, output, options, overwrite), groups, options, console
             )
     else:
-        batch = Reconstruction(weights, images, output, options, overwrite, pairs, prepared, order)
+        batch = Reconstruction(weights, images, output, options, overwrite)
         if options.dry_run:
             return dry_run(batch, options, console)
         worked = work_through(batch, options, console)
@@ -242,6 +236,7 @@ class Reconstruction(Batch[Outcome]):
     ) -> None:
         """Take the arguments of `reconstruct`; see which frames there are, and read no image.
 
+        `pairs` and `prepared`, where these are known already; `order`, where only some frames are to be made;
         `weights_to_come`, where the weights are to carry another record before anything is made.
 
         Raises

@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,17 +23,17 @@ from lfpiv_cli.files.shares import Deadline, awaited
 from lfpiv_cli.names import FlowMethod, Kept, RunMethod
 from lfpiv_cli.verbs import correlate as correlating
 from lfpiv_cli.verbs import track as tracking
-from lfpiv_cli.verbs.batches import ALL, Batch, BatchOptions, Failure, Stamp, WorkOptions, stamp_of, work_through
+from lfpiv_cli.verbs.batches import ALL, BatchOptions, Failure, Stamp, Worked, WorkOptions, stamp_of, work_through
 from lfpiv_cli.verbs.build_weights import BuildWeightsOptions, build_weights_file
 from lfpiv_cli.verbs.calibrate import CalibrateOptions, calibrate_snapshot
 from lfpiv_cli.verbs.combine import combine_vectors
-from lfpiv_cli.verbs.correlate import CorrelateOptions, Correlation, correlate_files
+from lfpiv_cli.verbs.correlate import CorrelateOptions, Correlation
 from lfpiv_cli.verbs.follow import PLAYBACK, TRACKS, FollowOptions, follow_particles
 from lfpiv_cli.verbs.frames import ImageOptions
 from lfpiv_cli.verbs.pairs import PairByPair, PairOptions, failures_of
 from lfpiv_cli.verbs.particles import Prepared
-from lfpiv_cli.verbs.reconstruct import Reconstruction, ReconstructOptions, reconstruct_files
-from lfpiv_cli.verbs.track import TrackOptions, Tracks, grid_paths, track_particles
+from lfpiv_cli.verbs.reconstruct import Reconstruction, ReconstructOptions
+from lfpiv_cli.verbs.track import TrackOptions, Tracks, grid_paths
 
 RECORD = "run.json"
 # What becomes of a step: its files are made; complete and left as they are; or complete and their record is another, as
@@ -295,8 +296,8 @@ class Chain:
 
     def reconstruction(self, method: FlowMethod, weights: Path, to_come: Gone | None = None) -> Reconstruction:
         """Return the batch of the frames of this share, of weights as they are `to_come` if they change."""
-        by_particles = method == "particles"
-        chosen = replace(PARTICLES, residual=self.options.keep == "all") if by_particles else VOLUMES
+        by_particles, kept = method == "particles", self.options.keep == "all" or not self.pairs.separate
+        chosen = replace(PARTICLES, residual=kept) if by_particles else VOLUMES
         options = replace(chosen, **self._of_images, **self._resuming)
         given = (weights, self.options.images, self.steps.output / method, options, self._overwrite)
         return Reconstruction(*given, self.pairs if by_particles else None, self._prepared, self.order, to_come)
@@ -314,18 +315,28 @@ class Chain:
 
     def in_pairs(self, method: FlowMethod, found: Reconstruction, file_bytes: float | None = None) -> PairByPair[Any]:
         """Return the batch of pairs, each from its images to its vectors or tracks, of so many bytes if known."""
-        of_pair: Callable[..., Batch[Any]] = Correlation if method == "volumes" else Tracks
-        given = (self._measuring(method)[1], self._overwrite)
         results = self.of_pairs(RESULTS[method])
         targets = [Target(path, dict, grid_paths(path, 1) if method == "particles" else ()) for path in results]
-        return PairByPair(found, of_pair, given, self.pairs, targets, file_bytes)
+        return PairByPair(found, partial(self._measured, method), self.pairs, targets, file_bytes)
 
-    def _measuring(self, method: FlowMethod) -> tuple[Callable[..., dict[str, Any]], CorrelateOptions | TrackOptions]:
-        """Return what measures pairs by a method, and its options."""
-        dt_s = self.options.dt_s
+    def _measured(
+        self,
+        method: FlowMethod,
+        files: Sequence[Path],
+        output: Path,
+        pairs: Pairs | None,
+        gone: Mapping[Path, Gone] | None = None,
+    ) -> Correlation | Tracks:
+        """Return the batch of pairs of volumes, or of particles."""
+        dt_s, resuming = self.options.dt_s, self._resuming
         if method == "volumes":
-            return correlate_files, CorrelateOptions(dt_s=dt_s, **self._resuming)
-        return track_particles, TrackOptions(dt_s=dt_s, grid=True, **self._resuming)
+            return Correlation(files, output, CorrelateOptions(dt_s=dt_s, **resuming), self._overwrite, pairs, gone)
+        return Tracks(files, output, TrackOptions(dt_s=dt_s, grid=True, **resuming), self._overwrite, pairs, gone)
+
+    def _worked(self, batch: Correlation | Tracks | Reconstruction) -> dict[str, Any]:
+        """Work through a batch of which nothing fails; return what is told of it."""
+        worked: Worked[Any] = work_through(batch, self.batch_options(shared=False), self.steps.console)
+        return worked.ensure_whole(batch.summary(worked), batch.unit)
 
     def _by_pairs(self, method: FlowMethod, weights: Path) -> Vectors:
         """Measure the flow in each pair, `keep` has it one after the other or all frames first."""
@@ -353,10 +364,9 @@ class Chain:
             pairs = [self.pairs.pairs[number] for number in numbers]
             place = {k: place for place, k in enumerate(sorted({k for pair in pairs for k in pair}))}
             ours = replace(self.pairs, pairs=tuple((place[first], place[second]) for first, second in pairs))
-            measure, options = self._measuring(method)
 
             def make() -> dict[str, Any]:
-                return measure([files[k] for k in place], output, options, **self.common, pairs=ours)
+                return self._worked(self._measured(method, [files[k] for k in place], output, ours))
 
         made = [path for number in numbers for path in dict.fromkeys((paths[number], vectors[number]))]
         self._take(name, made, make)
@@ -369,13 +379,13 @@ class Chain:
         if self.options.shard != ALL:
             self.steps.console.say("tracks go through all frames: the same command without --shard makes them")
             return {}
-        tracks, (measure, options) = self.steps.output / TRACKS, self._measuring("particles")
+        tracks = self.steps.output / TRACKS
         grids = grid_paths(tracks, len(found) - 1)
         if failed or len(self.pairs.pairs) < len(grids):
             error = "a frame of the sequence is missing, and tracks would take those beside it for neighbours in time"
             self.failures.append(Failure(TRACKS, error))
             return {}
-        self._take("track", [tracks, *grids], lambda: measure(found, tracks, options, **self.common))
+        self._take("track", [tracks, *grids], lambda: self._worked(self._measured("particles", found, tracks, None)))
         return dict(enumerate(grids))
 
     def following(self, dry_run: bool = False) -> FollowOptions:
@@ -389,16 +399,10 @@ class Chain:
 
     def _reconstructed(self, method: FlowMethod, weights: Path) -> tuple[list[Path], set[str]]:
         """Reconstruct all frames into a folder; return the files, and the names of frames that failed."""
-        by_particles, before = method == "particles", len(self.failures)
-        paths, images = self._of_frames(method), self.options.images
-        options = replace(PARTICLES if by_particles else VOLUMES, **self._of_images, **self._resuming)
-        known: dict[str, Any] = {"prepared": self._prepared, "order": self.order}
-        known["pairs"] = self.pairs if by_particles else None
-        self._take(
-            "reconstruct particles" if by_particles else "reconstruct",
-            [paths[k] for k in self.order],
-            lambda: reconstruct_files(weights, images, paths[0].parent, options, **self.common, **known),
-        )
+        paths, before = self._of_frames(method), len(self.failures)
+        name = "reconstruct particles" if method == "particles" else "reconstruct"
+        made = [paths[k] for k in self.order]
+        self._take(name, made, lambda: self._worked(self.reconstruction(method, weights)))
         return paths, {failure.name for failure in self.failures[before:]}
 
     @property

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, overload
+from typing import Any
 
 import numpy as np
 
@@ -49,6 +48,7 @@ from lfpiv_cli.verbs.fields import fields_of
 from lfpiv_cli.verbs.frames import dt_notices
 from lfpiv_cli.verbs.pairs import PairBatch, PairBatchOptions, sequence_of
 from lfpiv_cli.verbs.tracks import (
+    Lazy,
     Tracking,
     TracksOf,
     ensure_frames,
@@ -64,35 +64,19 @@ from lfpiv_cli.verbs.tracks import (
 KEPT_FRAMES = 2 * max(HALVES_FRAMES) + 1
 
 
-class SeenFrames(Sequence[Seen]):
+class SeenFrames(Lazy[Seen]):
     """The particles of a sequence's frames, read when they are asked for; the last few stay in memory."""
 
     def __init__(self, count: int, read: Callable[[int], Points]) -> None:
         """Take how many frames there are, and what reads one."""
-        self._count, self._read = count, read
-        self._kept: OrderedDict[int, Seen] = OrderedDict()
+        super().__init__(count, lru_cache(KEPT_FRAMES)(self._seen))
+        self._read = read
         self._counts: dict[int, int] = {}
 
-    def __len__(self) -> int:
-        """Return how many frames there are."""
-        return self._count
-
-    @overload
-    def __getitem__(self, number: int) -> Seen: ...
-
-    @overload
-    def __getitem__(self, number: slice) -> list[Seen]: ...
-
-    def __getitem__(self, number: int | slice) -> Seen | list[Seen]:
-        """Return the particles of a frame."""
-        if isinstance(number, slice):
-            return [self[each] for each in range(self._count)[number]]
-        if number not in self._kept:
-            self._kept[number] = seen_in(self._read(range(self._count)[number]))
-            self._counts[number] = len(self._kept[number])
-            if len(self._kept) > KEPT_FRAMES:
-                self._kept.popitem(last=False)
-        return self._kept[number]
+    def _seen(self, number: int) -> Seen:
+        found = seen_in(self._read(number))
+        self._counts[number] = len(found)
+        return found
 
     def particles(self, number: int) -> int:
         """Return how many particles a frame has."""
@@ -153,10 +137,9 @@ def track_particles(
     *,
     overwrite: bool = False,
     console: Console = CONSOLE,
-    pairs: Pairs | None = None,
 ) -> dict[str, Any]:
-    """Follow particles from frame to frame, in pairs or over a sequence; `pairs`, where they are known already."""
-    batch = Tracks(particles, output, options, overwrite, pairs)
+    """Follow particles from frame to frame, in pairs or over a sequence."""
+    batch = Tracks(particles, output, options, overwrite)
     if options.dry_run:
         return dry_run(batch, options, console)
     worked = work_through(batch, options, console)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar, overload
 
@@ -24,6 +24,32 @@ from lfpiv_cli.tracks.sequences import SHORTEST, follow, scatter_in, states_at
 from lfpiv_cli.tracks.tracking import SEARCH_LENSES, wrong_link_variance
 from lfpiv_cli.tracks.tracking import track as match
 from lfpiv_cli.verbs.checks import few_notices
+
+Item = TypeVar("Item")
+
+
+class Lazy(Sequence[Item]):
+    """Items that are made when they are asked for."""
+
+    def __init__(self, count: int, make: Callable[[int], Item]) -> None:
+        """Take how many there are, and what makes one."""
+        self._places, self._make = range(count), make
+
+    def __len__(self) -> int:
+        """Return how many there are."""
+        return len(self._places)
+
+    @overload
+    def __getitem__(self, number: int) -> Item: ...
+
+    @overload
+    def __getitem__(self, number: slice) -> list[Item]: ...
+
+    def __getitem__(self, number: int | slice) -> Item | list[Item]:
+        """Return one, or some of them."""
+        if isinstance(number, slice):
+            return [self._make(place) for place in self._places[number]]
+        return self._make(self._places[number])
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,8 +106,13 @@ class SequenceTracks:
 
     @property
     def paths(self) -> Sequence[Paths]:
-        """The tracks that pass from each frame to the next."""
-        return _Paths(self)
+        """The tracks that pass from each frame to the next, those of one interval computed at a time."""
+        return Lazy(len(self.frames) - 1, self._path)
+
+    def _path(self, number: int) -> Paths:
+        """Return the tracks that pass from a frame to the next, half-way between the two."""
+        state = states_at(self.found, self.frames, number + 0.5, self.scatter, self.half_frames)[1]
+        return Paths(state.position_mm, state.velocity, state.velocity_sigma)
 
     def summary(self) -> dict[str, Any]:
         """Return counts and figures, units in their names."""
@@ -96,29 +127,6 @@ class SequenceTracks:
             "noise_over_stated": scatter.noise.tolist() if scatter.noise_known else None,
             "acceleration_m_s2": acceleration.tolist() if scatter.bending_known else None,
         }
-
-
-class _Paths(Sequence[Paths]):
-    """The paths of tracks in each interval between frames, one computed at a time."""
-
-    def __init__(self, tracks: SequenceTracks) -> None:
-        self._tracks = tracks
-
-    def __len__(self) -> int:
-        return len(self._tracks.frames) - 1
-
-    @overload
-    def __getitem__(self, number: int) -> Paths: ...
-
-    @overload
-    def __getitem__(self, number: slice) -> list[Paths]: ...
-
-    def __getitem__(self, number: int | slice) -> Paths | list[Paths]:
-        if isinstance(number, slice):
-            return [self[each] for each in range(len(self))[number]]
-        tracks, time = self._tracks, range(len(self))[number] + 0.5
-        state = states_at(tracks.found, tracks.frames, time, tracks.scatter, tracks.half_frames)[1]
-        return Paths(state.position_mm, state.velocity, state.velocity_sigma)
 
 
 def track(
