@@ -223,12 +223,7 @@ class Worked(Generic[Made]):
             write_text(path, listed + "\n", overwrite=True)
 
     def ensure_whole(self, summary: dict[str, Any], unit: str) -> dict[str, Any]:
-        """Return the summary of a batch of which nothing failed.
-
-        Raises
-        ------
-        PartialError : something did
-        """
+        """Return the summary of a batch of which nothing failed (PartialError: something did)."""
         if not self.failures:
             return summary
         told = f"{len(self.failures)} of {self.total()} {unit}s failed, the first because {self.failures[0].error}"
@@ -332,12 +327,7 @@ def _settle(
     work: Frames,
     worked: Worked[Made],
 ) -> None:
-    """Note what became of an output.
-
-    Raises
-    ------
-    InputError : it could not be made, and the batch is not to go on without it
-    """
+    """Note what became of an output (InputError: it could not be made, and the batch is not to go on without it)."""
     name = batch.names[number]
     if isinstance(made, InputError):
         if not keep_going:
@@ -366,12 +356,7 @@ def stamp_of(path: Path) -> Stamp:
 
 
 def dry_run(batch: Batch[Any], options: WorkOptions, console: Console) -> dict[str, Any]:
-    """Return what a batch would make, and what that takes; write nothing.
-
-    Raises
-    ------
-    LfpivError : the batch would not begin
-    """
+    """Return what a batch would make, and what that takes; write nothing (LfpivError: the batch would not begin)."""
     share = _share(batch, options, console)
     targets = [batch.targets[number] for number in share]
     needed = [share[k] for k in pending(targets, (), batch.overwrite, options.resume, dry=True)]

@@ -186,10 +186,7 @@ def curved_summary(content: WeightsFile) -> dict[str, Any]:
     if isinstance(operator, StripOperator):
         misfit = operator.misfit_l1
         middle_and_worst = (
-            {
-                "column_misfit_l1_median": float(np.median(misfit)),
-                "column_misfit_l1_largest": float(misfit.max()),
-            }
+            {"column_misfit_l1_median": float(np.median(misfit)), "column_misfit_l1_largest": float(misfit.max())}
             if misfit.size
             else {}
         )

@@ -192,12 +192,7 @@ def light_notices(rig: Config, pictures: Photographs, found: Calibration) -> lis
 
 
 def ensure_pictures(whites: int, boards: int, depths: int) -> None:
-    """Refuse numbers of pictures and depths that make no calibration.
-
-    Raises
-    ------
-    UsageError
-    """
+    """Refuse numbers of pictures and depths that make no calibration (UsageError)."""
     if not whites and not boards:
         raise UsageError("calibrate-snapshot needs a picture: --white, --board or both")
     if depths not in (0, max(boards, 1)) or (boards > 1 and not depths):
@@ -242,12 +237,7 @@ class CalibrateOptions:
 
 
 def calibrate_snapshot(
-    config: Path,
-    output: Path,
-    options: CalibrateOptions,
-    *,
-    overwrite: bool = False,
-    console: Console = CONSOLE,
+    config: Path, output: Path, options: CalibrateOptions, *, overwrite: bool = False, console: Console = CONSOLE
 ) -> dict[str, Any]:
     """Find the lattice in white images and the focal plane in a snapshot of the board, or rays in boards at depths."""
     white, board, depth_mm = options.white, options.board, options.depth_mm

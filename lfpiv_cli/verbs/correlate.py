@@ -135,12 +135,7 @@ def usable_voxels(settings: Config, grid: Grid, mask: NDArray[Any] | None) -> ND
 
 
 def ensure_alike(first: Volume, second: Volume, names: tuple[str, str]) -> None:
-    """Refuse two volumes that were not made alike.
-
-    Raises
-    ------
-    InputError
-    """
+    """Refuse two volumes that were not made alike (InputError)."""
     if first.grid != second.grid:
         raise InputError(f"{names[1]}: its grid {second.grid} differs from that of {names[0]}, {first.grid}")
     if first.reference.name != second.reference.name:

@@ -157,12 +157,7 @@ def reader(
 
 
 def read_frame(frame: Frame, shape: tuple[int, int]) -> Image:
-    """Read a frame.
-
-    Raises
-    ------
-    InputError : it cannot be read, or has another shape
-    """
+    """Read a frame (InputError: it cannot be read, or has another shape)."""
     if frame.fault is not None:
         raise InputError(frame.fault)
     return image_files.read_page(frame.path, frame.page, shape)
@@ -181,11 +176,7 @@ def _readable(read: Callable[[int], Image], numbers: Iterable[int], keep_going: 
 
 
 def mask_of(
-    mask: str | Path | None,
-    frames: Sequence[Frame],
-    shape: tuple[int, int],
-    pitch_px: float,
-    keep_going: bool = False,
+    mask: str | Path | None, frames: Sequence[Frame], shape: tuple[int, int], pitch_px: float, keep_going: bool = False
 ) -> Image | None:
     """Return the mask, 0 where pixels are left out: of a file, or of what does not move in the frames (`still`)."""
     if mask is None:
@@ -340,12 +331,7 @@ def bench_of(
 
 
 def check_frame(bench: Bench, raw: Image, place: str) -> None:
-    """Refuse a raw frame that shows nothing at all: no pixel is usable, or it has one value everywhere.
-
-    Raises
-    ------
-    InputError
-    """
+    """Refuse a raw frame that shows nothing at all: no pixel is usable, or it has one value everywhere (InputError)."""
     if raw.min() == raw.max():
         raise InputError(f"{place}: has one value everywhere ({raw.flat[0]:g}); it shows no particles")
     if bench.unusable(raw).all():

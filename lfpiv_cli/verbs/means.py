@@ -51,10 +51,7 @@ class Mean(Batch[None]):
     def make(self, number: int, _work: Frames) -> None:
         """Write it."""
         found = statistics_of(field for path in self.inputs for field in _fields_in(path))
-        extra: Extra = {
-            "displacement_rms_voxel": (found.rms_voxel, "voxel"),
-            "samples": (found.samples, "1"),
-        }
+        extra: Extra = {"displacement_rms_voxel": (found.rms_voxel, "voxel"), "samples": (found.samples, "1")}
         if found.mean.dt_s is not None:
             to_velocity = np.asarray(found.mean.voxel_mm) * MM_TO_M / found.mean.dt_s
             extra["velocity_rms"] = (found.rms_voxel * to_velocity, "m/s")

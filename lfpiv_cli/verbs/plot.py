@@ -28,13 +28,7 @@ from lfpiv_cli.files.figures import describe, file_figures, is_recording, record
 from lfpiv_cli.files.hdf5 import open_h5
 from lfpiv_cli.files.hdf5_checks import member
 from lfpiv_cli.files.images import read_image
-from lfpiv_cli.files.particle_file import (
-    PARTICLES_FORMAT,
-    TRACKS_FORMAT,
-    TRAJECTORIES_FORMAT,
-    Points,
-    read_points,
-)
+from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, TRACKS_FORMAT, TRAJECTORIES_FORMAT, Points, read_points
 from lfpiv_cli.files.weights_file import FORMAT, WeightsFile, open_weights
 from lfpiv_cli.notice import written
 from lfpiv_cli.pictures import calibration as of_calibration
@@ -203,7 +197,7 @@ def _of_all_tracks(tracks: Points) -> dict[str, Drawn]:
     """Return the figures that tracks of two frames and of a sequence have in common."""
     arrays = tracks.arrays
     figures = {
-        "velocities": Drawn("The velocity components.", partial(of_tracks.velocities_figure, arrays["velocity"])),
+        "velocities": Drawn("The velocity components.", partial(of_tracks.velocities_figure, arrays["velocity"]))
     }
     if np.isfinite(arrays["link_probability"]).any():
         figures["links"] = Drawn(
@@ -264,12 +258,7 @@ def _of_weights(path: Path) -> dict[str, Drawn]:
 
 
 def column_of(content: WeightsFile, voxel: tuple[int, int, int]) -> Figure:
-    """Return the figure of the pixels that a voxel (ix, iy, iz) lights.
-
-    Raises
-    ------
-    InputError : it lights none
-    """
+    """Return the figure of the pixels that a voxel (ix, iy, iz) lights (InputError: it lights none)."""
     ix, iy, iz = voxel
     rows, columns, shares = content.weights.column(iz, iy, ix)
     if not shares.size:

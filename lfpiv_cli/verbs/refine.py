@@ -118,12 +118,7 @@ def _walls(settings: Config, lit: Sequence[Image], before: Calibration, console:
     flow = ChannelFlow(settings.grid(), settings.channel.width_mm, chosen.particle_diameter_mm, wave_light_of(chosen))
     with console.progress(len(lit) * STEPS + 1, "refine") as advance:
         found = refine(
-            lit,
-            before,
-            settings.camera_model(),
-            ObjectSpace(settings.media_model(), window, "exact"),
-            flow,
-            advance,
+            lit, before, settings.camera_model(), ObjectSpace(settings.media_model(), window, "exact"), flow, advance
         )
 
     def draw() -> Figure:

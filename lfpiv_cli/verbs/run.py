@@ -131,12 +131,7 @@ def run(
 
 
 def _made(chain: Chain, choose: Callable[[Path], Choice], overwrite: bool) -> dict[str, Any]:
-    """Take all steps; return what is told of them.
-
-    Raises
-    ------
-    PartialError : something failed
-    """
+    """Take all steps; return what is told of them (PartialError: something failed)."""
     steps, options, output = chain.steps, chain.options, chain.steps.output
     ensure_writable(output / RECORD, overwrite=True)
     weights = chain.weights()

@@ -215,13 +215,7 @@ def simulate_particles(
         )
     with console.progress(scene.frames * tracers.count, "simulate") as advance:
         found = scenes.simulate_particles(
-            camera,
-            space,
-            tracers,
-            motion,
-            _generator(settings, 2),
-            still=still,
-            progress=advance,
+            camera, space, tracers, motion, _generator(settings, 2), still=still, progress=advance
         )
     for name, image in zip(images, found.images, strict=True):
         write_tiff(paths[name], image, overwrite)
@@ -245,12 +239,7 @@ def simulate_particles(
 
 
 def ensure_experiment(settings: Config) -> None:
-    """Refuse a config from which no white image, board and flow can be simulated, before anything is.
-
-    Raises
-    ------
-    ConfigError
-    """
+    """Refuse a config from which no white image, board and flow can be simulated, before anything is (ConfigError)."""
     reference = simulated_reference(settings)
     _motion(settings, reference)
     _flow_space(settings, reference)
@@ -371,12 +360,7 @@ def _board_space(settings: Config) -> Space:
 
 
 def _flow_space(settings: Config, reference: Reference) -> Space:
-    """Return what the tracers are seen through.
-
-    Raises
-    ------
-    ConfigError : paraxial rays through a scene
-    """
+    """Return what the tracers are seen through (ConfigError: paraxial rays through a scene)."""
     scene = settings.scene_space()
     if scene is not None and settings.simulation.refraction == "paraxial":
         raise ConfigError(
@@ -391,12 +375,7 @@ def _flow_space(settings: Config, reference: Reference) -> Space:
 
 
 def _motion(settings: Config, reference: Reference) -> scenes.Motion:
-    """Return how the tracers move.
-
-    Raises
-    ------
-    ConfigError : there is no flow, or no time between its images
-    """
+    """Return how the tracers move (ConfigError: there is no flow, or no time between its images)."""
     scene, dt_s = settings.simulation, settings.correlation.dt_s
     if dt_s is None:
         raise ConfigError(f"{settings.source}: correlation.dt_s: is missing, and images of a flow need it")

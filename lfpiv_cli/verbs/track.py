@@ -36,14 +36,7 @@ from lfpiv_cli.reference import Reference
 from lfpiv_cli.tracks.candidates import Seen, Trajectories
 from lfpiv_cli.tracks.sequences import HALVES_FRAMES
 from lfpiv_cli.verbs.batches import Worked, dry_run, work_through
-from lfpiv_cli.verbs.checks import (
-    Quality,
-    calibration_notices,
-    few_notices,
-    field_notices,
-    quality_of,
-    quality_of_all,
-)
+from lfpiv_cli.verbs.checks import Quality, calibration_notices, few_notices, field_notices, quality_of, quality_of_all
 from lfpiv_cli.verbs.fields import fields_of
 from lfpiv_cli.verbs.frames import dt_notices
 from lfpiv_cli.verbs.pairs import PairBatch, PairBatchOptions, sequence_of

@@ -130,10 +130,7 @@ class SequenceTracks:
 
 
 def track(
-    *particles: Points,
-    dt_s: float | None = None,
-    search_voxel: float | None = None,
-    shortest: int | None = None,
+    *particles: Points, dt_s: float | None = None, search_voxel: float | None = None, shortest: int | None = None
 ) -> Tracked:
     """Follow particles from one frame to the next, or over a sequence of frames.
 
@@ -246,12 +243,7 @@ class Tracked(TracksOf[Points]):
 
 
 def ensure_frames(frames: int, shortest: int | None) -> None:
-    """Refuse what makes no tracks.
-
-    Raises
-    ------
-    UsageError
-    """
+    """Refuse what makes no tracks (UsageError)."""
     if frames < 2:
         raise UsageError("track needs the particles of two frames at least")
     if frames == 2 and shortest is not None:
@@ -259,12 +251,7 @@ def ensure_frames(frames: int, shortest: int | None) -> None:
 
 
 def ensure_particles(counts: Sequence[int], names: Sequence[str]) -> None:
-    """Refuse frames of which not even two hold particles.
-
-    Raises
-    ------
-    InputError
-    """
+    """Refuse frames of which not even two hold particles (InputError)."""
     if np.count_nonzero(counts) < 2:
         empty = [name for name, count in zip(names, counts, strict=True) if not count]
         raise InputError(f"{', '.join(empty)}: no particles; tracks need some in two frames at least")

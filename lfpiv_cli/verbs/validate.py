@@ -329,12 +329,7 @@ def validate_all(config: Path, output: Path, *, overwrite: bool = False, console
 
 
 def ensure_complete(config: Path) -> None:
-    """Refuse a config that lacks what the last of the reports needs before the first is made.
-
-    Raises
-    ------
-    ConfigError
-    """
+    """Refuse a config that lacks what the last of the reports needs before the first is made (ConfigError)."""
     settings = load_config(config)
     depths_in_volume(settings)
     ensure_experiment(settings)

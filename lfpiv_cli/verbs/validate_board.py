@@ -133,12 +133,7 @@ def validate_board(
 
 
 def depths_in_volume(settings: Config) -> tuple[float, ...]:
-    """Return those of the paper's depths that lie in the volume.
-
-    Raises
-    ------
-    ConfigError : they are too few
-    """
+    """Return those of the paper's depths that lie in the volume (ConfigError: they are too few)."""
     low, high = settings.grid().bounds_mm(2)
     depths = tuple(depth for depth in DEPTHS_MM if low < depth < high)
     if len(depths) < FEWEST_DEPTHS:

@@ -235,12 +235,7 @@ def columns_bytes(voxels: int) -> float:
 
 
 def check_rays(settings: Config, source: Source, grid: Grid) -> None:
-    """Refuse to count more rays for a grid, padding included, than there is time for.
-
-    Raises
-    ------
-    ConfigError
-    """
+    """Refuse to count more rays for a grid, padding included, than there is time for (ConfigError)."""
     rays, voxels = _rays(settings, source, grid), math.prod(grid.shape_xyz)
     if rays > MOST_RAYS:
         raise ConfigError(
