@@ -273,16 +273,8 @@ def _view_notices(smallest: float, largest: float, grid: Grid) -> list[Notice]:
         return []
     text = "a part of it lies outside the camera's view, where nothing will be found"
     remedy = "a smaller volume, or another centre_mm"
-    return [
-        Notice(
-            "volume-out-of-view",
-            "volume",
-            text,
-            remedy,
-            float(smallest),
-            f"at least {LEAST_SEEN:g} of each voxel's light on the sensor",
-        )
-    ]
+    expected = f"at least {LEAST_SEEN:g} of each voxel's light on the sensor"
+    return [Notice("volume-out-of-view", "volume", text, remedy, float(smallest), expected)]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -37,6 +37,7 @@ from lfpiv_cli.reconstruction.images import FULL_SCALES, Mask, defects, light, s
 from lfpiv_cli.validation import planning
 from lfpiv_cli.validation.planning import share_beyond
 from lfpiv_cli.verbs.calibrate import NO_BOARD, calibration_notices, calibration_of, photographs
+from lfpiv_cli.verbs.checks import word_of
 from lfpiv_cli.verbs.planning import (
     Bench,
     Line,
@@ -51,7 +52,6 @@ from lfpiv_cli.verbs.planning import (
     seeding_line,
     worst,
 )
-from lfpiv_cli.verbs.verdicts import word_of
 from lfpiv_cli.weights.build import aligned, default_padding
 
 # What images tell of an experiment before anything is made of them: a verdict a line.

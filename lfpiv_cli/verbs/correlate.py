@@ -51,8 +51,8 @@ from lfpiv_cli.verbs.checks import (
     quality_of_all,
     window_notices,
 )
+from lfpiv_cli.verbs.fields import Mean, are_measured, arrays_of, mean_of_measured
 from lfpiv_cli.verbs.frames import dt_notices
-from lfpiv_cli.verbs.means import Mean, are_measured, arrays_of, mean_of_measured
 from lfpiv_cli.verbs.pairs import ComingPairs, PairBatch, PairBatchOptions, result_pairs, watched, work_as_they_come
 
 
@@ -346,8 +346,8 @@ class Correlation(PairBatch[Outcome, CorrelateOptions]):
 
         usable = usable_voxels(job.settings, first.grid, None if drawn is None else drawn.array)
         settings = job.settings.correlation_settings(first.grid.spacing_mm)
-        made = {f"{role} {path.name}": earlier_record(path) or {} for role, path in job.inputs().items()}
-        notices = [*calibration_notices(made), *window_notices(first, settings, one.name)]
+        of_volumes = {f"{role} {path.name}": earlier_record(path) or {} for role, path in job.inputs().items()}
+        notices = [*calibration_notices(of_volumes), *window_notices(first, settings, one.name)]
         share = 1.0 / count_passes(settings.windows)
         field = measure(
             volumes(), first.grid, settings, mask=usable, progress=lambda passes: work.advance(share * passes)
@@ -360,15 +360,11 @@ class Correlation(PairBatch[Outcome, CorrelateOptions]):
         notices += [*field_notices(quality, name), *pair_notices(field, quality, name)]
         work.console.warn(notices)
         derived = derived_fields(field) if self._options.derived else None
-        vtkhdf.write_vectors(
-            target.path,
-            field,
-            first.reference,
-            provenance=with_warnings(target.record, notices),
-            # What is complete is skipped: in the place of what is made there is nothing, or something broken.
-            overwrite=self.overwrite or self._options.resume,
-            extra=arrays_of(derived) if derived else None,
-        )
+        made = with_warnings(target.record, notices)
+        extra = arrays_of(derived) if derived else None
+        # What is complete is skipped: in the place of what is made there is nothing, or something broken.
+        replacing = self.overwrite or self._options.resume
+        vtkhdf.write_vectors(target.path, field, first.reference, provenance=made, overwrite=replacing, extra=extra)
         rejected = int(np.count_nonzero(field.flag >= REJECTED))
         return Outcome(quality, rejected, derived.divergence_rms if derived else None)
 

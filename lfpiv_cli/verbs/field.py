@@ -25,21 +25,21 @@ from lfpiv_cli.files.inputs import content_of
 from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, TRAJECTORIES_FORMAT, Points, read_points, read_tracks
 from lfpiv_cli.files.provenance import OF_COORDINATES, record, with_warnings
 from lfpiv_cli.flow.field import MASKED, MM_TO_M, REJECTED, VectorField
-from lfpiv_cli.flow.from_tracks import WindowGrid
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.names import Divergence
 from lfpiv_cli.tracks.candidates import NO_TRACK, Trajectories
 from lfpiv_cli.tracks.in_time import Motion, high_derivatives_in, motions_at
 from lfpiv_cli.verbs.fields import (
+    Extra,
     FittedField,
+    arrays_of,
     ensure_one_time,
     fit_notices,
     fitted,
     samples_of_tracks,
     samples_of_vectors,
 )
-from lfpiv_cli.verbs.means import Extra, arrays_of
-from lfpiv_cli.verbs.tracks import seen_in, settings_of
+from lfpiv_cli.verbs.tracks import seen_in, settings_of, windows_of
 
 MM2_PER_M2 = 1e6
 
@@ -185,9 +185,7 @@ def _on_windows(
     samples: Samples, settings: Config, knot_mm: float, wrong_share: float, figures: dict[str, Any]
 ) -> PressureResult:
     """Fit the pressure and return it at the centres of the windows."""
-    volume = settings.grid()
-    windows = settings.windows_voxel(volume.spacing_mm)[-1]
-    grid = WindowGrid(volume, windows, settings.overlap(volume.spacing_mm)).centres
+    grid = windows_of(settings, None).centres
     nodes = grid.centres_mm()
     everywhere = np.concatenate([samples.points_mm, nodes.reshape(-1, 3)])
     lattice = pressure.lattice_over(everywhere.min(axis=0), everywhere.max(axis=0), knot_mm)

@@ -31,8 +31,8 @@ from lfpiv_cli.synthetic.vortices import MM_PER_M
 from lfpiv_cli.validation import planning
 from lfpiv_cli.validation.planning import Miniature, Tracer
 from lfpiv_cli.verbs.build_weights import ray_source
+from lfpiv_cli.verbs.checks import WORDS, Word
 from lfpiv_cli.verbs.particles import light_of
-from lfpiv_cli.verbs.verdicts import WORDS, Word
 from lfpiv_cli.verbs.weights_cost import Cost, check_rig, cost_notices, cost_of, particles_core_s, rig_notices
 from lfpiv_cli.weights.build import default_padding
 from lfpiv_cli.weights.scene import Source
@@ -52,8 +52,8 @@ GOOD_ERROR, LARGEST_ERROR = 0.05, 0.25
 GOOD_VOXEL, LARGEST_VOXEL = 0.55, 1.05
 # Sides of windows that differ by less are alike: they are written with few digits.
 WINDOWS_ALIKE = 0.02
-# Of the coarse window's side: up to the one displacements are measured well, beyond the other hardly at all.
-GOOD_SHARE_OF_WINDOW, LARGEST_SHARE_OF_WINDOW = 0.25, 0.5
+# Of the coarse window's side: beyond it displacements are hardly measured at all.
+LARGEST_SHARE_OF_WINDOW = 0.5
 # By waves each depth takes about a second.
 DEPTHS, DEPTHS_BY_WAVES = 21, 11
 # Light of frequency-doubled lasers, where no wavelength is given. A microlens that spreads it over less of a pixel than

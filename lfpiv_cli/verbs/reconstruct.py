@@ -122,18 +122,14 @@ def volume_of(
         operator = operator.for_image(as_if_lit(image, excluded))
     sums = bench.sums_without(operator, excluded)
     result = solve(operator, image, bench.settings.solver_settings(), sums=sums, progress=progress)
-    return Volume(
-        content.weights.to_world(result.volume),
-        content.reference.grid_from_focal_point(content.weights.grid),
-        content.reference,
-        attributes=content.reference.attributes()
-        | {
-            "residual": result.residual,
-            "excluded_pixels": int(np.count_nonzero(excluded)),
-            "support_voxels": result.support_voxels,
-        },
-        provenance=dict(provenance),
-    )
+    told = content.reference.attributes() | {
+        "residual": result.residual,
+        "excluded_pixels": int(np.count_nonzero(excluded)),
+        "support_voxels": result.support_voxels,
+    }
+    grid = content.reference.grid_from_focal_point(content.weights.grid)
+    array = content.weights.to_world(result.volume)
+    return Volume(array, grid, content.reference, attributes=told, provenance=dict(provenance))
 
 
 @dataclass(frozen=True)

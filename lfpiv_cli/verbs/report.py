@@ -44,9 +44,7 @@ from lfpiv_cli.files.vtkhdf import VECTORS_FORMAT, VOLUME_FORMAT, open_vectors, 
 from lfpiv_cli.flow.field import MASKED, REJECTED, VALID, VectorField
 from lfpiv_cli.notice import written
 from lfpiv_cli.pictures.points import MOST_LINES, has_views, lines_view, trajectory_lines
-from lfpiv_cli.verbs.checks import quality_of
-from lfpiv_cli.verbs.plot import figures_of
-from lfpiv_cli.verbs.verdicts import (
+from lfpiv_cli.verbs.checks import (
     CALIBRATES,
     OF_IMAGES,
     Part,
@@ -55,9 +53,11 @@ from lfpiv_cli.verbs.verdicts import (
     of_two_ways,
     of_vectors,
     of_warnings,
+    quality_of,
     verb_of,
     verdicts,
 )
+from lfpiv_cli.verbs.plot import figures_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

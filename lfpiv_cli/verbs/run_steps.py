@@ -107,6 +107,10 @@ class Steps:
         """Return how many steps were made, kept, or recorded anew."""
         return sum(step["state"] == state for step in self.told["steps"].values())
 
+    def summary(self) -> dict[str, Any]:
+        """Return what is told of the steps."""
+        return {"steps_made": self.count(MADE), "steps_kept": self.count(KEPT), "folder": str(self.output)}
+
     def write(self, *, whole: bool = False) -> None:
         """Write down what is known so far: of steps to come what the run before told, unless this is the `whole` run.
 
@@ -248,14 +252,9 @@ class Chain:
     @property
     def photographs(self) -> CalibrateOptions:
         """What the calibration is given."""
-        options = self.options
+        given, picture = self.options, self.steps.output / PICTURE
         return CalibrateOptions(
-            white=options.white,
-            dark=options.dark,
-            board=options.board,
-            depth_mm=options.depth_mm,
-            picture=self.steps.output / PICTURE,
-            resume=True,
+            white=given.white, dark=given.dark, board=given.board, depth_mm=given.depth_mm, picture=picture, resume=True
         )
 
     @property

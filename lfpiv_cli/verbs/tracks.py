@@ -15,6 +15,7 @@ from lfpiv_cli.files.particle_file import POSITION, TRACKS_FORMAT, TRAJECTORIES_
 from lfpiv_cli.files.provenance import OF_FRAMES, ensure_agreement, even_step_s, record
 from lfpiv_cli.flow.field import MM_TO_M, VectorField
 from lfpiv_cli.flow.from_tracks import Paths, WindowGrid, vectors_from_paths
+from lfpiv_cli.flow.windows import Walls
 from lfpiv_cli.notice import warn_of
 from lfpiv_cli.reference import Reference
 from lfpiv_cli.scale import Scale
@@ -228,18 +229,20 @@ class TracksOf(Generic[Rows]):
 
     def fields(self) -> Iterator[VectorField]:
         """Yield what `vectors` returns, one at a time."""
-        settings, volume = self.settings, self.settings.grid()
-        windows = WindowGrid(
-            volume,
-            settings.windows_voxel(volume.spacing_mm)[-1],
-            settings.overlap(volume.spacing_mm),
-            settings.masking_walls(),
-        )
+        settings = self.settings
+        windows = windows_of(settings, settings.masking_walls())
         return (vectors_from_paths(paths, windows, settings.correlation.dt_s) for paths in self.paths)
 
 
 class Tracked(TracksOf[Points]):
     """Tracks in memory."""
+
+
+def windows_of(settings: Config, walls: Walls | None) -> WindowGrid:
+    """Return the final interrogation windows of a config, masked beyond walls."""
+    volume = settings.grid()
+    size, overlap = settings.windows_voxel(volume.spacing_mm)[-1], settings.overlap(volume.spacing_mm)
+    return WindowGrid(volume, size, overlap, walls)
 
 
 def ensure_frames(frames: int, shortest: int | None) -> None:

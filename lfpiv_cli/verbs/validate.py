@@ -197,7 +197,8 @@ def validate_flow(
     inputs = given(config=config, particles=particles) | (given(vectors=vectors) if vectors else made)
     methods = {name: measured_of(path, settings, particles, is_simulated) for name, path in made.items()}
     if particles and named is not None and methods["measured"].flow is None:
-        console.warn([_other_flow(config, particles)])
+        text = f"the particles of {particles.name} do not move as the flow that it names, and are taken for the truth"
+        console.warn([Notice("truth-contradicts", config.name, text, "validation.flow of this experiment, or none")])
     truth = "analytic flow" if all(measured.flow for measured in methods.values()) else "particles"
     figures = {name: measured.figures(duct, walls) for name, measured in methods.items()}
     limits = settings.validation.limits.model_dump()
@@ -263,15 +264,6 @@ def measured_of(vectors: Path, settings: Config, particles: Path | None, is_simu
 def _at_windows(flow: Flow, field: VectorField) -> NDArray[np.float64]:
     centres = field.grid.centres_mm()
     return flow(centres.reshape(-1, 3)).reshape(centres.shape)
-
-
-def _other_flow(config: Path, particles: Path) -> Notice:
-    return Notice(
-        "truth-contradicts",
-        config.name,
-        f"the particles of {particles.name} do not move as the flow that it names, and are taken for the truth",
-        "validation.flow of this experiment, or none",
-    )
 
 
 def light_notices(settings: Config) -> list[Notice]:

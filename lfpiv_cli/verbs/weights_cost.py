@@ -171,13 +171,9 @@ def cost_of(settings: Config, camera: Camera, source: Source, grid: Grid) -> Cos
     entries = ENTRIES_PER_PIXEL * float(camera.micro_image_lattice_px().pitch.mean())
     both_axes, pixel_bytes = planes * (strips * columns + rows) * entries, FLOAT_BYTES * pixels
     products = planes * rows * entries * (columns + camera.columns)
-    return Cost(
-        voxels,
-        both_axes * ENTRY_BYTES + pixel_bytes,
-        both_axes * ENTRY_S + pixels * MASK_PIXEL_S,
-        held + both_axes * ENTRY_BYTES + pixel_bytes,
-        projections * products / MULTIPLICATIONS_PER_S,
-    )
+    weights_bytes, weights_s = both_axes * ENTRY_BYTES + pixel_bytes, both_axes * ENTRY_S + pixels * MASK_PIXEL_S
+    image_bytes, image_s = held + both_axes * ENTRY_BYTES + pixel_bytes, projections * products / MULTIPLICATIONS_PER_S
+    return Cost(voxels, weights_bytes, weights_s, image_bytes, image_s)
 
 
 def ensure_fits(cost: Cost, output: Path) -> None:
@@ -264,13 +260,6 @@ def cost_notices(cost: Cost) -> list[Notice]:
         f"{written(cost.image_core_s / 60.0, 2)} minutes of a core"
     )
     remedy = "a smaller volume or larger voxels; --dry-run tells what others will take"
-    return [
-        Notice(
-            "heavy-work",
-            "volume",
-            text,
-            remedy,
-            max(cost.weights_core_s / LONG_S, most / MUCH_BYTES),
-            f"at most {LONG_S / 60.0:g} minutes for the weights and {MUCH_BYTES / 1e9:g} GB",
-        )
-    ]
+    share = max(cost.weights_core_s / LONG_S, most / MUCH_BYTES)
+    expected = f"at most {LONG_S / 60.0:g} minutes for the weights and {MUCH_BYTES / 1e9:g} GB"
+    return [Notice("heavy-work", "volume", text, remedy, share, expected)]
