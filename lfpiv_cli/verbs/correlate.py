@@ -93,21 +93,7 @@ def correlate(
     UsageError
         Plain arrays are given without `voxel_mm`.
     """
-    volumes: list[Volume] = []
-    for each in (a, b):
-        if isinstance(each, Volume):
-            volumes.append(each)
-            continue
-        if voxel_mm is None:
-            raise UsageError("correlate: plain arrays need voxel_mm, the size of a voxel along x, y, z")
-        array = np.asarray(each, dtype=np.float32)
-        if array.ndim != 3:
-            raise InputError(f"a volume of shape {array.shape}, expected (nz, ny, nx)")
-        nz, ny, nx = array.shape
-        # About the origin.
-        grid = Grid.centred((nx, ny, nz), voxel_mm, (0.0, 0.0, 0.0))
-        volumes.append(Volume(array, grid, FOCAL_POINT, {}, {}))
-    first, second = volumes
+    first, second = (_as_volume(each, voxel_mm) for each in (a, b))
     ensure_alike(first, second, ("the first volume", "the second volume"))
     config = first.provenance.get("config")
     carried = carried_config(first.provenance, "the volume") if config else Config.from_resolved({})
@@ -141,6 +127,19 @@ def ensure_alike(first: Volume, second: Volume, names: tuple[str, str]) -> None:
     if first.reference.name != second.reference.name:
         raise InputError(f"{names[1]}: its coordinates have another origin than those of {names[0]}")
     ensure_agreement([first.provenance, second.provenance], names, OF_FRAMES)
+
+
+def _as_volume(volume: Volume | NDArray[Any], voxel_mm: tuple[float, float, float] | None) -> Volume:
+    """Return a volume as such, a plain array about the origin."""
+    if isinstance(volume, Volume):
+        return volume
+    if voxel_mm is None:
+        raise UsageError("correlate: plain arrays need voxel_mm, the size of a voxel along x, y, z")
+    array = np.asarray(volume, dtype=np.float32)
+    if array.ndim != 3:
+        raise InputError(f"a volume of shape {array.shape}, expected (nz, ny, nx)")
+    nz, ny, nx = array.shape
+    return Volume(array, Grid.centred((nx, ny, nz), voxel_mm, (0.0, 0.0, 0.0)), FOCAL_POINT, {}, {})
 
 
 # Numbers of eight bytes that a file has of each vector at most, and derived ones besides.

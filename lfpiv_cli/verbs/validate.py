@@ -173,7 +173,6 @@ def validate_flow(
     is_simulated = vectors is None
     if is_simulated and particles is not None:
         raise UsageError("--particles needs --vectors: the flow of a simulation is known")
-    paths = {name: output / name for name in ("flow.json", *PICTURES, SLICES, RADII)}
     settings = load_config(config)
     if is_simulated:
         ensure_experiment(settings)
@@ -181,10 +180,8 @@ def validate_flow(
     named = settings.simulation.flow if is_simulated else settings.validation.flow or settings.simulation.flow
     duct, pipe = duct_of(named), named if named is not None and named.kind == "pipe" else None
     walls = None if pipe is None else RoundWall(pipe.radius_mm, pipe.centre_mm, pipe.axis)
-    if duct is None:
-        del paths[SLICES]
-    if pipe is None:
-        del paths[RADII]
+    drawn = [*PICTURES, *([] if duct is None else [SLICES]), *([] if pipe is None else [RADII])]
+    paths = {name: output / name for name in ("flow.json", *drawn)}
     for target in paths.values():
         ensure_writable(target, overwrite, given(config=config, vectors=vectors, particles=particles).values())
     ensure_drawing()
