@@ -28,7 +28,7 @@ from lfpiv_cli.flow.field import MASKED, MM_TO_M, REJECTED, VectorField
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.names import Divergence
 from lfpiv_cli.tracks.candidates import NO_TRACK, Trajectories
-from lfpiv_cli.tracks.in_time import high_derivatives_in, motions_at
+from lfpiv_cli.tracks.in_time import Motion, high_derivatives_in, motions_at
 from lfpiv_cli.verbs.fields import (
     Extra,
     FittedField,
@@ -105,8 +105,7 @@ def pressure_of(
         fit_field(moving, low, high), motion.position_mm
     )  # fmt: skip
     to_m_s2 = MM_TO_M / dt_s**2
-    # How much of the accelerations is wrong alike among neighbours.
-    neglected = float(np.linalg.norm(motion.neglected) / np.linalg.norm(motion.acceleration))
+    neglected = neglected_share(motion)
     samples = pressure.pressure_gradients(
         motion.position_mm, to_m_s2 * (motion.acceleration - friction), to_m_s2**2 * motion.covariance, density, sure
     )
@@ -172,6 +171,11 @@ def link_probability(trajectories: Points) -> Floats:
     found = np.ones(int(track.max(initial=-1)) + 1)
     np.multiply.at(found, track, np.nan_to_num(trajectories.arrays["link_probability"], nan=1.0))
     return found
+
+
+def neglected_share(motion: Motion) -> float:
+    """Return how much of the accelerations is wrong alike among neighbours."""
+    return float(np.linalg.norm(motion.neglected) / np.linalg.norm(motion.acceleration))
 
 
 def _rms(vectors: Floats) -> Floats:
