@@ -41,7 +41,7 @@ from lfpiv_cli.flow.windows import inside
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.notice import warn_of
 from lfpiv_cli.reference import FOCAL_POINT
-from lfpiv_cli.verbs.batches import ALL, BatchOptions, Expected, Worked, dry_run, work_through
+from lfpiv_cli.verbs.batches import ALL, BatchOptions, Expected, Failure, Worked, dry_run, work_through
 from lfpiv_cli.verbs.checks import (
     Quality,
     calibration_notices,
@@ -53,7 +53,7 @@ from lfpiv_cli.verbs.checks import (
 )
 from lfpiv_cli.verbs.fields import Mean, are_measured, arrays_of, mean_of_measured
 from lfpiv_cli.verbs.frames import dt_notices
-from lfpiv_cli.verbs.pairs import ComingPairs, PairBatch, PairBatchOptions, result_pairs, watched, work_as_they_come
+from lfpiv_cli.verbs.pairs import PairBatch, PairBatchOptions, coming_pairs, result_pairs, watched, work_as_they_come
 
 
 def correlate(
@@ -146,24 +146,6 @@ def _as_volume(volume: Volume | NDArray[Any], voxel_mm: tuple[float, float, floa
 NUMBERS_A_VECTOR, NUMBERS_DERIVED, NUMBER_BYTES = 16, 6, 8
 
 
-@dataclass(frozen=True)
-class Job:
-    """One result: the pairs of volumes that it is made of, and the settings."""
-
-    pairs: Sequence[tuple[Path, Path]]
-    settings: Config
-
-    def inputs(self) -> dict[str, Path]:
-        """Return the volumes by their role."""
-        if len(self.pairs) == 1:
-            return given(volume_a=self.pairs[0][0], volume_b=self.pairs[0][1])
-        return {
-            f"volume_{name}_{number:04d}": path
-            for number, pair in enumerate(self.pairs)
-            for name, path in zip("ab", pair, strict=True)
-        }
-
-
 @dataclass(frozen=True, kw_only=True)
 class CorrelateOptions(PairBatchOptions):
     """What `correlate` is given besides the volumes.
@@ -246,15 +228,16 @@ def _as_they_come(
         raise UsageError(f"--watch: {refused} is made from all pairs, some of which have not come yet; wait for them")
     if not options.are_told:
         raise UsageError("--watch needs --pairing: ab or sequence")
-    coming = ComingPairs(lambda files: result_pairs(files, options), console)
+    left_out: list[Failure] = []
 
     def of_pairs(files: Sequence[Path]) -> Correlation:
         two_by_two = tuple((number, number + 1) for number in range(0, len(files), 2))
         return Correlation(files, output, options, overwrite, Pairs(two_by_two))
 
-    groups = coming.groups(watched(folders, "results", options, console))
+    coming = watched(folders, "results", options, console)
+    groups = coming_pairs(coming, lambda files: result_pairs(files, options), console, left_out)
     with folder_of(output / folders[0].name):
-        return work_as_they_come(of_pairs, groups, options, console, lambda: coming.left_out)
+        return work_as_they_come(of_pairs, groups, options, console, left_out)
 
 
 @dataclass(frozen=True)
@@ -330,32 +313,32 @@ class Correlation(PairBatch[Outcome, CorrelateOptions]):
     def make(self, number: int, work: Frames) -> Outcome:
         """Correlate a pair, or all of them, and write the vectors."""
         target = self.targets[number]
-        job = self._job(number)
-        mask, (one, _) = self._options.mask_volume, job.pairs[0]
+        config, pairs, mask = self._settings_for(number), self._groups[number], self._options.mask_volume
+        one = pairs[0][0]
         first, drawn = vtkhdf.open_volume(one), None if mask is None else vtkhdf.open_volume(mask)
         if drawn is not None and drawn.grid != first.grid:
             raise InputError(f"{mask}: its grid {drawn.grid} differs from that of {one}, {first.grid}")
 
         def volumes() -> Iterator[tuple[NDArray[np.float32], NDArray[np.float32]]]:
-            for pair in job.pairs:
+            for pair in pairs:
                 a, b = (first if path == one else vtkhdf.open_volume(path) for path in pair)
                 for path, volume in zip(pair, (a, b), strict=True):
                     ensure_alike(first, volume, (str(one), str(path)))
                 yield a.array, b.array
 
-        usable = usable_voxels(job.settings, first.grid, None if drawn is None else drawn.array)
-        settings = job.settings.correlation_settings(first.grid.spacing_mm)
-        of_volumes = {f"{role} {path.name}": earlier_record(path) or {} for role, path in job.inputs().items()}
+        usable = usable_voxels(config, first.grid, None if drawn is None else drawn.array)
+        settings = config.correlation_settings(first.grid.spacing_mm)
+        of_volumes = {f"{role} {path.name}": earlier_record(path) or {} for role, path in self._volumes(number).items()}
         notices = [*calibration_notices(of_volumes), *window_notices(first, settings, one.name)]
         share = 1.0 / count_passes(settings.windows)
         field = measure(
             volumes(), first.grid, settings, mask=usable, progress=lambda passes: work.advance(share * passes)
         )
-        camera, media = job.settings.camera_model(), job.settings.media_model()
+        camera, media = config.camera_model(), config.media_model()
         field = with_locking(field, first.reference, camera.scale(media))
         quality, name = quality_of(field), target.path.name
-        records = ([self._record_of(path) for path in pair] for pair in job.pairs)
-        notices += dt_notices(job.settings.correlation.dt_s, records, name)
+        records = ([self._record_of(path) for path in pair] for pair in pairs)
+        notices += dt_notices(config.correlation.dt_s, records, name)
         notices += [*field_notices(quality, name), *pair_notices(field, quality, name)]
         work.console.warn(notices)
         derived = derived_fields(field) if self._options.derived else None
@@ -381,8 +364,19 @@ class Correlation(PairBatch[Outcome, CorrelateOptions]):
         """Those of the first volume that can be opened."""
         return self._settings_of(self._first)
 
-    def _job(self, number: int) -> Job:
-        """Return the pairs that a field is made of, and the settings."""
+    def _volumes(self, number: int) -> dict[str, Path]:
+        """Return the volumes that a field is made of by their role."""
+        pairs = self._groups[number]
+        if len(pairs) == 1:
+            return given(volume_a=pairs[0][0], volume_b=pairs[0][1])
+        return {
+            f"volume_{name}_{place:04d}": path
+            for place, pair in enumerate(pairs)
+            for name, path in zip("ab", pair, strict=True)
+        }
+
+    def _settings_for(self, number: int) -> Config:
+        """Return the settings that a field is made with."""
         group = self._groups[number]
         settings = self._settings_of(group[0][0])
         if settings.correlation.dt_s is None:
@@ -392,7 +386,7 @@ class Correlation(PairBatch[Outcome, CorrelateOptions]):
             names = [str(group[0][0]), str(group[-1][1])]
             step_s = ensure_even(told, names) if told and len(told) == len(steps) else None
             settings = settings.overridden("correlation", dt_s=step_s)
-        return Job(group, settings)
+        return settings
 
     def _record_of(self, volume: Path) -> Mapping[str, Any]:
         """Return the record of a volume, which may be gone."""
@@ -405,9 +399,10 @@ class Correlation(PairBatch[Outcome, CorrelateOptions]):
 
     def _record(self, number: int) -> dict[str, Any]:
         """Return the record that a field will carry."""
-        options, job = self._options, self._job(number)
+        options = self._options
         command = " ".join(["correlate", *["ensemble"] * options.ensemble, *["derived"] * options.derived])
-        return record(command, job.settings.resolved(), self._common | job.inputs(), gone=self._gone)
+        inputs = self._common | self._volumes(number)
+        return record(command, self._settings_for(number).resolved(), inputs, gone=self._gone)
 
 
 def field_bytes(settings: Config, grid: Grid, derived: bool = False) -> float:

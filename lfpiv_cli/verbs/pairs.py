@@ -214,13 +214,13 @@ def work_as_they_come(
     groups: Iterable[Sequence[Path]],
     options: BatchOptions,
     console: Console,
-    left_out: Callable[[], Sequence[Failure]] = tuple,
+    left_out: Sequence[Failure] = (),
 ) -> tuple[OfBatch, Worked]:
     """Work through a batch for each group of files; return the last one, and what became of all.
 
     Parameters
     ----------
-    left_out : returns, at the end, the files that were in no group
+    left_out : the files that were in no group, as known at the end
 
     Raises
     ------
@@ -239,49 +239,47 @@ def work_as_they_come(
             together.failures.append(Failure(group[0].stem, str(error)))
         else:
             together.add(work_through(batch, alone, console))
-    together.failures[:0] = left_out()
+    together.failures[:0] = left_out
     if batch is None:
         raise InputError(f"{together.failures[0].name}: {together.failures[0].error}")
     together.list_failures(options.failures)
     return batch, together
 
 
-class ComingPairs:
-    """The pairs of files that come one after the other.
+def coming_pairs(
+    coming: Iterable[Sequence[Path]],
+    pair: Callable[[Sequence[Path]], Pairs],
+    console: Console,
+    left_out: list[Failure],
+) -> Iterator[list[Path]]:
+    """Yield the files of pairs that are complete, two by two, as they come.
 
-    Attributes
+    Parameters
     ----------
-    left_out : the files of which no partner has come so far
+    pair : tells which of some files are pairs
+    left_out : is kept at the files of which no partner has come so far
     """
-
-    def __init__(self, pair: Callable[[Sequence[Path]], Pairs], console: Console) -> None:
-        """Take which of some files are pairs, and where it is told of those that are passed over."""
-        self._pair, self._console = pair, console
-        self._seen: list[Path] = []
-        self._made: set[tuple[int, int]] = set()
-        self._told: set[Notice] = set()
-        self.left_out: Sequence[Failure] = ()
-
-    def groups(self, coming: Iterable[Sequence[Path]]) -> Iterator[list[Path]]:
-        """Yield the files of pairs that are complete, two by two, as they come."""
-        for files in coming:
-            self._seen += files
-            if len(self._seen) < 2:
-                self.left_out = [Failure(str(self._seen[0]), "no other frame has come")]
-                continue
-            found = self._pair(self._seen)
-            fresh = [pair for pair in found.pairs if pair not in self._made]
-            self._made.update(fresh)
-            self.left_out = failures_of(found)
-            # Once: what is taken for granted, and files that have no partner though later pairs are complete.
-            last = max((second for _, second in self._made), default=0)
-            before = {str(path) for path in self._seen[:last]}
-            passed = Pairs((), tuple(each for each in found.left_out if each.name in before), found.notices)
-            unsaid = [notice for notice in passed.said() if notice not in self._told]
-            self._told.update(unsaid)
-            self._console.warn(unsaid)
-            if fresh:
-                yield [self._seen[number] for pair in fresh for number in pair]
+    seen: list[Path] = []
+    made: set[tuple[int, int]] = set()
+    told: set[Notice] = set()
+    for files in coming:
+        seen += files
+        if len(seen) < 2:
+            left_out[:] = [Failure(str(seen[0]), "no other frame has come")]
+            continue
+        found = pair(seen)
+        fresh = [each for each in found.pairs if each not in made]
+        made.update(fresh)
+        left_out[:] = failures_of(found)
+        # Once: what is taken for granted, and files that have no partner though later pairs are complete.
+        last = max((second for _, second in made), default=0)
+        before = {str(path) for path in seen[:last]}
+        passed = Pairs((), tuple(each for each in found.left_out if each.name in before), found.notices)
+        unsaid = [notice for notice in passed.said() if notice not in told]
+        told.update(unsaid)
+        console.warn(unsaid)
+        if fresh:
+            yield [seen[number] for numbers in fresh for number in numbers]
 
 
 # Pairs whose volumes or particles are dropped as soon as their vectors stand.
