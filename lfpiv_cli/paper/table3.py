@@ -38,7 +38,8 @@ from lfpiv_cli.validation.board import (
     board_figures,
     measure_dots,
 )
-from lfpiv_cli.verbs.validate_board import BoardBench, BoardSolver, bench_of, board_solver, placement_of
+from lfpiv_cli.verbs.simulate import placement_of
+from lfpiv_cli.verbs.validate_board import BoardBench, BoardSolver, bench_of, board_solver
 
 Half = Literal["ideal", "recorded"]
 Figures = dict[str, dict[str, Any]]

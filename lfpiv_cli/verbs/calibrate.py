@@ -11,27 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from lfpiv_cli.calibration import model
+from lfpiv_cli.calibration import light_checks, model, sheet
 from lfpiv_cli.calibration.lens_light import LensImages
-from lfpiv_cli.calibration.light_checks import (
-    dark_notices,
-    field_notices,
-    position_notices,
-    shape_notices,
-    shapes_of,
-    white_notices,
-)
 from lfpiv_cli.calibration.model import Calibration, DataSheet, Photographs
-from lfpiv_cli.calibration.sheet import (
-    board_notices,
-    check_f_numbers,
-    entrance_pupil_notices,
-    f_number_notices,
-    image_distance_notices,
-    magnification_notices,
-    narrow_notices,
-    points_notices,
-)
 from lfpiv_cli.calibration.white import by_aperture, lens_image_width
 from lfpiv_cli.console import CONSOLE, Console
 from lfpiv_cli.errors import ConfigError, UsageError
@@ -137,31 +119,34 @@ def calibration_of(rig: Config, pictures: Photographs) -> Calibration:
             )
     camera = rig.complete_camera() if pictures.whites else rig.camera_model()
     if camera is not None:
-        check_f_numbers(camera)
-    sheet = DataSheet(rig.camera.microlenses.layout, rig.micro_image_pitch_px(), camera)
+        sheet.check_f_numbers(camera)
+    told = DataSheet(rig.camera.microlenses.layout, rig.micro_image_pitch_px(), camera)
     has_board = pictures.board is not None or len(pictures.depth_boards) > 0
     if has_board and rig.board.medium == "fluid":
         rig.ensure_plane_layers("calibrating by a board in the fluid")
-    return model.calibrate(pictures, rig.rig() if has_board else None, sheet)
+    return model.calibrate(pictures, rig.rig() if has_board else None, told)
 
 
 def calibration_notices(rig: Config, pictures: Photographs, found: Calibration) -> list[Notice]:
     """Return what speaks against a calibration and the pictures that it is from."""
     camera = rig.complete_camera()
-    notices = [] if camera is None else f_number_notices(camera)
+    notices = [] if camera is None else sheet.f_number_notices(camera)
     if found.pose is not None and rig.board.dots is not None and rig.board.pattern != "charuco":
-        notices += board_notices(found.pose.dots_found, rig.board.dots)
+        notices += sheet.board_notices(found.pose.dots_found, rig.board.dots)
     if found.pose is not None:
-        notices += points_notices(found.pose.dots_found)
+        notices += sheet.points_notices(found.pose.dots_found)
     if found.pose is not None and camera is not None:
-        notices += [*magnification_notices(found.pose.magnification, camera), *field_notices(found.pose, camera)]
+        notices += [
+            *sheet.magnification_notices(found.pose.magnification, camera),
+            *light_checks.field_notices(found.pose, camera),
+        ]
         geometry, media = rig.rig().board, rig.media_model()
         if geometry.pattern == "dots":
             medium = media.in_air() if geometry.medium == "air" else media
-            notices += narrow_notices(geometry.dot_diameter_mm, found.pose.z0_mm, camera.scale(medium))
+            notices += sheet.narrow_notices(geometry.dot_diameter_mm, found.pose.z0_mm, camera.scale(medium))
     if found.ray_fit is not None and camera is not None:
         rays = found.ray_fit
-        notices += entrance_pupil_notices(rays.entrance_pupil_mm, rays.entrance_pupil_sigma_mm, camera)
+        notices += sheet.entrance_pupil_notices(rays.entrance_pupil_mm, rays.entrance_pupil_sigma_mm, camera)
     if camera is not None and found.pose is None and found.ray_fit is None:
         notices.append(NO_BOARD)
     notices += light_notices(rig, pictures, found)
@@ -170,8 +155,8 @@ def calibration_notices(rig: Config, pictures: Photographs, found: Calibration) 
     order = by_aperture(pictures.whites, pictures.dark)
     first, widest = (pictures.less_dark(pictures.whites[order[place]]) for place in (0, -1))
     width = lens_image_width(found.rectification.apply(widest), found.rectification.lattice_px)
-    notices += white_notices(first, found.fit, width, None if camera is None else camera.lens_image_width)
-    return notices if camera is None else notices + image_distance_notices(found.fit, camera)
+    notices += light_checks.white_notices(first, found.fit, width, None if camera is None else camera.lens_image_width)
+    return notices if camera is None else notices + sheet.image_distance_notices(found.fit, camera)
 
 
 def light_notices(rig: Config, pictures: Photographs, found: Calibration) -> list[Notice]:
@@ -182,12 +167,14 @@ def light_notices(rig: Config, pictures: Photographs, found: Calibration) -> lis
         return []
     width = 1.0 if camera is None else camera.lens_image_width
     images = LensImages.of(found.rectification, found.transmission, width)
-    notices = [] if pictures.dark is None else dark_notices(images, np.asarray(pictures.dark, dtype=np.float64))
+    notices = (
+        [] if pictures.dark is None else light_checks.dark_notices(images, np.asarray(pictures.dark, dtype=np.float64))
+    )
     if found.transmission is not None:
-        notices += shape_notices(shapes_of(images, found.rectification.image_shape))
+        notices += light_checks.shape_notices(light_checks.shapes_of(images, found.rectification.image_shape))
     for number, board in enumerate(boards, 1):
         name = "board image" if len(boards) == 1 else f"board image {number}"
-        notices += position_notices(images, pictures.less_dark(board), name, MOVED_SINCE_WHITE)
+        notices += light_checks.position_notices(images, pictures.less_dark(board), name, MOVED_SINCE_WHITE)
     return notices
 
 

@@ -10,16 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lfpiv_cli.calibration import light_checks
 from lfpiv_cli.calibration.lens_light import LensImages, dark_level
-from lfpiv_cli.calibration.light_checks import (
-    CERTAIN_SIGMAS,
-    LIT_SIGMAS,
-    exposure_notices,
-    level_notices,
-    position_notices,
-    saturated_share,
-    uniform_notices,
-)
 from lfpiv_cli.calibration.model import Calibration
 from lfpiv_cli.console import CONSOLE, Console
 from lfpiv_cli.errors import ConfigError, InputError
@@ -99,7 +91,7 @@ class Seen:
     def above(self) -> Image:
         """Light above the background, 0 where it is within noise."""
         rest = self.less_dark - np.float32(self.level)
-        return np.where(rest > LIT_SIGMAS * self.noise, rest, np.float32(0.0))
+        return np.where(rest > light_checks.LIT_SIGMAS * self.noise, rest, np.float32(0.0))
 
 
 def lattice_of(settings: Config, pictures: Pictures) -> tuple[Calibration | None, list[Line]]:
@@ -181,7 +173,7 @@ def _seen(bench: Bench, name: str, raw: Image, dark: Image | None, lattice: Cali
 
 def _counted(bench: Bench, seen: Seen) -> tuple[float, float]:
     """Return tracers for each lens that looks at the volume, and the light of one."""
-    level = max(LIT_SIGMAS * seen.noise, 0.5)
+    level = max(light_checks.LIT_SIGMAS * seen.noise, 0.5)
     part = planning.part_in_front(bench.camera, bench.media, bench.bounds_mm)
     rest = seen.less_dark[part] - np.float32(seen.level)
     lit = float(np.mean(rest > level)), level, float(np.mean(rest, dtype=np.float64))
@@ -201,7 +193,7 @@ def _counted(bench: Bench, seen: Seen) -> tuple[float, float]:
 
 
 def _exposure(bench: Bench, seen: Seen) -> Line:
-    share = saturated_share(seen.less_dark, seen.saturated, (seen.level, seen.noise))
+    share = light_checks.saturated_share(seen.less_dark, seen.saturated, (seen.level, seen.noise))
     is_known = np.isfinite(seen.raw)
     if not is_known.any():
         return Line("exposure", "no", f"{seen.name}: none of its pixels is a number")
@@ -210,7 +202,7 @@ def _exposure(bench: Bench, seen: Seen) -> Line:
         f"{seen.name}: the brightest pixel is at {float(seen.raw[is_known].max()) / scale:.0%} of {scale:g} counts, "
         f"{share:.2%} of the lit ones are saturated"
     )
-    notices = exposure_notices(share, seen.name)
+    notices = light_checks.exposure_notices(share, seen.name)
     if not notices:
         return Line("exposure", "good", reason)
     return Line("exposure", word_of(notices[0].record()), f"{reason}: {notices[0].remedy}")
@@ -244,10 +236,10 @@ def _lens_images(_bench: Bench, seen: Seen) -> Line:
     if not found.lit or not np.isfinite(sigma):
         return Line(about, "unknown", f"{seen.name}: too little light tells whether they have moved")
     remedy = "take white image and frames with the camera as it is"
-    notices = position_notices(seen.lens_images, seen.less_dark, seen.name, remedy)
+    notices = light_checks.position_notices(seen.lens_images, seen.less_dark, seen.name, remedy)
     if not notices:
         return Line(about, "good", f"{seen.name}: moved by {size:.2f} +- {sigma:.2f} px since the white image")
-    off = notices[0].code == "light-off-lens-images" or size - CERTAIN_SIGMAS * sigma > MOST_MOVED * pitch
+    off = notices[0].code == "light-off-lens-images" or size - light_checks.CERTAIN_SIGMAS * sigma > MOST_MOVED * pitch
     return Line(about, "no" if off else "look", f"{notices[0].about}: {notices[0].text}; {notices[0].remedy}")
 
 
@@ -258,7 +250,7 @@ def _background(_bench: Bench, seen: Seen) -> Line:
             f"{seen.name}: {written(seen.level)} counts, with noise of {written(seen.noise, 2)}; --white tells more"
         )
         return Line("background", "unknown", reason)
-    notices = level_notices(seen.lens_images, seen.less_dark, seen.name)
+    notices = light_checks.level_notices(seen.lens_images, seen.less_dark, seen.name)
     if notices:
         return Line("background", "look", f"{seen.name}: {notices[0].text}; {notices[0].remedy}")
     return Line("background", "good", f"{seen.name}: {written(seen.level, 2)} counts beside the dark image")
@@ -283,7 +275,7 @@ def _beyond(bench: Bench, seen: Seen) -> Line:
 
 def _tracers(bench: Bench, seen: Seen, number: float) -> Line:
     if seen.lens_images is not None and bench.found is not None:
-        for notice in uniform_notices(seen.lens_images, bench.found.fit, seen.less_dark, seen.name):
+        for notice in light_checks.uniform_notices(seen.lens_images, bench.found.fit, seen.less_dark, seen.name):
             return Line("tracers", "no", f"{notice.about}: {notice.text}; {notice.remedy}")
     if not np.isfinite(number):
         reason = "hardly a pixel is dark: two tracers per microlens or more, or haze; volumes err less than particles"

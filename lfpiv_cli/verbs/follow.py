@@ -210,9 +210,14 @@ def follow_particles(
         return dry_run(PlannedFrames(here, inputs, overwrite, beside, left_out), options, console)
     content = searchable_weights(weights, content, settings)
     there = [number for number, frame in enumerate(frames) if frame.fault is None]
-    needed = [_needed(targets, there, inputs, options, overwrite, targets is passes[-1]) for targets in passes]
+    # It is known that what is to be made can be written.
+    replacing, needed = overwrite or options.resume, []
+    for targets in passes:
+        needed.append([there[k] for k in pending([targets[k] for k in there], inputs, overwrite, options.resume)])
+        for number in needed[-1] if options.residuals and targets is passes[-1] else []:
+            ensure_writable(residual_path(targets[number].path), replacing, inputs)
     for name in (TRACKS, PLAYBACK):
-        ensure_writable(output / name, overwrite or options.resume, inputs)
+        ensure_writable(output / name, replacing, inputs)
     dark = options.dark_image(shape)
     pitch_px = float(content.camera.micro_image_lattice_px().pitch.max())
     bench = bench_of(content, settings, dark, mask_of(options.mask, frames, shape, pitch_px, options.keep_going))
@@ -252,7 +257,7 @@ def follow_particles(
             go_both_ways(sequence, found, stores[0].read, stores[1], work.advance)
             found = None
     counts = {"frames": len(frames), "found": len(needed[-1]), "skipped": len(there) - len(needed[-1])}
-    summary = _write_tracks(output, sequence, stores[-1], found, overwrite or options.resume, console)
+    summary = _write_tracks(output, sequence, stores[-1], found, replacing, console)
     worked = Worked(dict.fromkeys(there), failures=left_out)
     worked.list_failures(options.failures)
     return worked.ensure_whole(counts | summary | size.summary(), "frame")
@@ -263,36 +268,21 @@ def _readable(frames: Sequence[Frame], shape: tuple[int, int]) -> tuple[list[Fra
 
     It begins with two that can be read, as these are found together.
     """
-    seen = [replace(frame, fault=_fault(frame, shape)) for frame in frames]
+    seen: list[Frame] = []
+    for frame in frames:
+        try:
+            raw, fault = read_frame(frame, shape), None
+        except InputError as error:
+            fault = str(error)
+        else:
+            if raw.min() == raw.max():
+                fault = f"{frame.path}: has one value everywhere; it shows no particles"
+        seen.append(replace(frame, fault=fault))
     begins = (k for k in range(len(seen) - 1) if seen[k].fault is None and seen[k + 1].fault is None)
     begin = next(begins, len(seen))
     before = "is before the first two frames in a row that can be read"
     left_out = [frame for k, frame in enumerate(seen) if k < begin or frame.fault is not None]
     return seen[begin:], [Failure(frame.stem, frame.fault or f"{frame.path}: {before}") for frame in left_out]
-
-
-def _fault(frame: Frame, shape: tuple[int, int]) -> str | None:
-    """Return why a frame cannot be followed; None where it can."""
-    try:
-        raw = read_frame(frame, shape)
-    except InputError as error:
-        return str(error)
-    return f"{frame.path}: has one value everywhere; it shows no particles" if raw.min() == raw.max() else None
-
-
-def _needed(
-    targets: Sequence[Target],
-    there: Sequence[int],
-    inputs: Sequence[Path],
-    options: FollowOptions,
-    overwrite: bool,
-    last: bool,
-) -> list[int]:
-    """Return which of the frames that are there have to be made, after it is known that they can be written."""
-    needed = [there[k] for k in pending([targets[k] for k in there], inputs, overwrite, options.resume)]
-    for number in needed if options.residuals and last else []:
-        ensure_writable(residual_path(targets[number].path), overwrite or options.resume, inputs)
-    return needed
 
 
 def _write_tracks(

@@ -18,14 +18,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lfpiv_cli.calibration import light_checks
 from lfpiv_cli.calibration.lens_light import LensImages
-from lfpiv_cli.calibration.light_checks import (
-    exposure_notices,
-    level_notices,
-    position_notices,
-    saturated_share,
-    uniform_notices,
-)
 from lfpiv_cli.calibration.rectification import Rectification
 from lfpiv_cli.calibration.sheet import sheet_fit
 from lfpiv_cli.errors import InputError
@@ -342,8 +336,8 @@ def frame_notices(bench: Bench, raw: Image, lit: Image, name: str) -> list[Notic
     """Return what speaks against a raw frame, given also with dark or background taken off (`lit`)."""
     unusable = bench.unusable(raw)
     seen, used = np.where(unusable, np.float32(np.nan), lit), lit[~unusable]
-    share = saturated_share(seen, unusable & ~bench.lasting, bench.lens_images.background(seen))
-    notices = exposure_notices(share, name)
+    share = light_checks.saturated_share(seen, unusable & ~bench.lasting, bench.lens_images.background(seen))
+    notices = light_checks.exposure_notices(share, name)
     # At most the standard deviation of the noise: by what lies below 0, or around the median.
     noise, below = MAD_TO_SIGMA * float(np.median(np.abs(used - np.median(used)))), used[used < 0.0]
     if below.size:
@@ -358,11 +352,11 @@ def frame_notices(bench: Bench, raw: Image, lit: Image, name: str) -> list[Notic
         notices.append(Notice("frame-dark", name, text, remedy, brightest, f"above {written(NOISE_SIGMAS * noise)}"))
     images, calibration = bench.lens_images, bench.content.weights.calibration
     if calibration is not None:
-        notices += uniform_notices(images, calibration.fit, seen, name)
+        notices += light_checks.uniform_notices(images, calibration.fit, seen, name)
     return [
         *notices,
-        *level_notices(images, seen, name),
-        *position_notices(images, seen, name, MOVED_SINCE_CALIBRATION),
+        *light_checks.level_notices(images, seen, name),
+        *light_checks.position_notices(images, seen, name, MOVED_SINCE_CALIBRATION),
     ]
 
 

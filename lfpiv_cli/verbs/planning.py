@@ -33,7 +33,7 @@ from lfpiv_cli.validation.planning import Miniature, Tracer
 from lfpiv_cli.verbs.build_weights import ray_source
 from lfpiv_cli.verbs.checks import WORDS, Word
 from lfpiv_cli.verbs.particles import light_of
-from lfpiv_cli.verbs.weights_cost import Cost, check_rig, cost_notices, cost_of, particles_core_s, rig_notices
+from lfpiv_cli.verbs.weights_cost import TRACER_S, Cost, check_rig, cost_notices, cost_of, rig_notices
 from lfpiv_cli.weights.build import default_padding
 from lfpiv_cli.weights.scene import Source
 
@@ -227,7 +227,7 @@ def rig_figures(bench: Bench) -> dict[str, Any]:
         "expected_velocity_m_s": bench.velocity_m_s,
         "best_dt_s": _best_time_s(bench),
     }
-    figures["estimated_particles_core_s"] = particles_core_s(best)
+    figures["estimated_particles_core_s"] = TRACER_S * best
     # Bytes and seconds for one image, where the rig can be worked with at all.
     with contextlib.suppress(ConfigError, InputError):
         figures |= _cost_of(bench).summary() | {
@@ -469,7 +469,7 @@ def _cost(bench: Bench) -> Line:
     files = PIXEL_BYTES * bench.camera.columns * bench.camera.rows + VOXEL_BYTES * int(np.prod(bench.grid.shape_xyz))
     reason = (
         f"weights {written(cost.weights_core_s, 2)} s of a core, each image {written(cost.image_core_s, 2)} s by "
-        f"volumes, {written(particles_core_s(best), 2)} s by particles at the best seeding; "
+        f"volumes, {written(TRACER_S * best, 2)} s by particles at the best seeding; "
         f"{written(max(cost.weights_bytes, cost.image_bytes) / 1e9, 2)} GB of memory, {written(files / 1e6, 2)} MB of "
         "disk an image"
     )

@@ -310,9 +310,14 @@ def _board_still(
     rng: np.random.Generator,
     progress: Callable[[int], None],
 ) -> scenes.SimulatedStill:
+    placement, level = placement_of(settings, z_mm), settings.simulation.peak_counts
+    return scenes.simulate_board(_recording(settings), space, board, placement, level, rng, progress)
+
+
+def placement_of(settings: Config, z_mm: float) -> BoardPlacement:
+    """Return where the simulated board stands at a depth from the focal plane."""
     scene = settings.simulation
-    placement = BoardPlacement(z_mm, scene.board_offset_mm, scene.board_tilt_deg, scene.board_rotation_deg)
-    return scenes.simulate_board(_recording(settings), space, board, placement, scene.peak_counts, rng, progress)
+    return BoardPlacement(z_mm, scene.board_offset_mm, scene.board_tilt_deg, scene.board_rotation_deg)
 
 
 def _begin(

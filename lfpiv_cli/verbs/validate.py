@@ -25,31 +25,10 @@ from lfpiv_cli.names import Moment
 from lfpiv_cli.notice import Notice
 from lfpiv_cli.optics.tracing import ObjectSpace
 from lfpiv_cli.synthetic.vortices import Flow
+from lfpiv_cli.validation import methods as of_methods
+from lfpiv_cli.validation import weights as of_weights
 from lfpiv_cli.validation.flow import Duct, limits_missed, truth_at_points
-from lfpiv_cli.validation.methods import (
-    Measured,
-    errors_figure,
-    flow_figure,
-    lower_error,
-    profiles_figure,
-    radius_figure,
-    slices_figure,
-)
 from lfpiv_cli.validation.volume import volume_figures
-from lfpiv_cli.validation.weights import (
-    SHOWN,
-    SHOWN_BEHIND_FACES,
-    TABLE1_MM,
-    columns_figure,
-    in_view,
-    make_columns,
-    make_curved_columns,
-    sample_voxels,
-    seen_voxels,
-    similarity_figure,
-    weights_figures,
-    weights_limits_missed,
-)
 from lfpiv_cli.verbs.chain import measure_images, simulate_images
 from lfpiv_cli.verbs.simulate import ensure_experiment
 from lfpiv_cli.verbs.validate_board import depths_in_volume, validate_board
@@ -111,29 +90,31 @@ def validate_weights(
     rng = np.random.default_rng(chosen.seed)
     scene = settings.scene_space()
     if scene is not None:
-        voxels = seen_voxels(camera, scene, grid, len(TABLE1_MM) + chosen.sample, rng)
-        long_count = np.where(np.arange(len(voxels)) < len(TABLE1_MM), chosen.long_count_rays, 0)
+        voxels = of_weights.seen_voxels(camera, scene, grid, len(of_weights.TABLE1_MM) + chosen.sample, rng)
+        long_count = np.where(np.arange(len(voxels)) < len(of_weights.TABLE1_MM), chosen.long_count_rays, 0)
         with console.progress(len(voxels), "validate weights") as advance:
-            columns = make_curved_columns(camera, scene, grid, voxels, rng, long_count, advance)
+            columns = of_weights.make_curved_columns(camera, scene, grid, voxels, rng, long_count, advance)
     else:
         try:
             window = settings.window_model()
         except ConfigError:
             window = None  # there is nothing to trace directly
         space = ObjectSpace(settings.media_model(), window)
-        known = [centre for centre in TABLE1_MM if in_view(camera, space, centre, grid.spacing_mm)]
-        centres = np.concatenate([np.array(known).reshape(-1, 3), sample_voxels(grid, chosen.sample, rng)])
+        known = [
+            centre for centre in of_weights.TABLE1_MM if of_weights.in_view(camera, space, centre, grid.spacing_mm)
+        ]
+        centres = np.concatenate([np.array(known).reshape(-1, 3), of_weights.sample_voxels(grid, chosen.sample, rng)])
         long_count = np.where(np.arange(len(centres)) < len(known), chosen.long_count_rays, 0)
         with console.progress(len(centres), "validate weights") as advance:
-            columns = make_columns(camera, space, centres, grid.spacing_mm, rng, long_count, advance)
-    figures = weights_figures(columns, long_count)
-    missed = weights_limits_missed(figures, chosen.limits.model_dump())
+            columns = of_weights.make_columns(camera, space, centres, grid.spacing_mm, rng, long_count, advance)
+    figures = of_weights.weights_figures(columns, long_count)
+    missed = of_weights.weights_limits_missed(figures, chosen.limits.model_dump())
     provenance = record("validate weights", settings.resolved(), {"config": config})
     write_json(paths[".json"], {"figures": figures, "limits_missed": missed, "provenance": provenance}, overwrite)
-    shown = min(len(TABLE1_MM), len(columns))
-    names = SHOWN if scene is None else SHOWN_BEHIND_FACES
-    write_picture(paths["_columns.png"], columns_figure(columns[:shown], names), overwrite)
-    write_picture(paths["_similarity.png"], similarity_figure(figures, shown), overwrite)
+    shown = min(len(of_weights.TABLE1_MM), len(columns))
+    names = of_weights.SHOWN if scene is None else of_weights.SHOWN_BEHIND_FACES
+    write_picture(paths["_columns.png"], of_weights.columns_figure(columns[:shown], names), overwrite)
+    write_picture(paths["_similarity.png"], of_weights.similarity_figure(figures, shown), overwrite)
     summary = {
         f"{name}.{figure}": each[figure]
         for name, each in figures.items()
@@ -145,10 +126,10 @@ def validate_weights(
     return {"voxels": len(columns)} | summary
 
 
-PICTURES: dict[str, Callable[[Mapping[str, Measured]], Figure]] = {
-    "flow.png": flow_figure,
-    "flow_errors.png": errors_figure,
-    "flow_profiles.png": profiles_figure,
+PICTURES: dict[str, Callable[[Mapping[str, of_methods.Measured]], Figure]] = {
+    "flow.png": of_methods.flow_figure,
+    "flow_errors.png": of_methods.errors_figure,
+    "flow_profiles.png": of_methods.profiles_figure,
 }
 # Of a square duct, and of a round pipe.
 SLICES, RADII = "flow_slices.png", "flow_radii.png"
@@ -210,16 +191,16 @@ def validate_flow(
         "truth": truth,
     }
     if len(methods) > 1:
-        report["lower_error"] = lower_error(methods, figures)
+        report["lower_error"] = of_methods.lower_error(methods, figures)
     report["provenance"] = record("validate flow", settings.resolved(), inputs)
     write_json(paths["flow.json"], report, overwrite)
     for name, draw in PICTURES.items():
         write_picture(paths[name], draw(methods), overwrite)
     if duct is not None:
-        write_picture(paths[SLICES], slices_figure(methods, duct), overwrite)
+        write_picture(paths[SLICES], of_methods.slices_figure(methods, duct), overwrite)
     if pipe is not None and walls is not None:
         fields = {name: measured.field for name, measured in methods.items()}
-        write_picture(paths[RADII], radius_figure(fields, walls, pipe.mean_velocity_m_s), overwrite)
+        write_picture(paths[RADII], of_methods.radius_figure(fields, walls, pipe.mean_velocity_m_s), overwrite)
     summary = _summary(figures) if is_simulated else _scalars(figures["measured"])
     summary["truth"] = truth
     if len(methods) > 1:
@@ -236,7 +217,7 @@ def duct_of(flow: FlowSection | None) -> Duct | None:
     return Duct(flow.width_mm, flow.centre_mm, flow.axis, flow.mean_velocity_m_s)
 
 
-def measured_of(vectors: Path, settings: Config, particles: Path | None, is_simulated: bool) -> Measured:
+def measured_of(vectors: Path, settings: Config, particles: Path | None, is_simulated: bool) -> of_methods.Measured:
     """Return vectors with the true flow at their places."""
     field = vtkhdf.open_vectors(vectors)
     if field.dt_s is None:
@@ -246,16 +227,16 @@ def measured_of(vectors: Path, settings: Config, particles: Path | None, is_simu
         reference = vtkhdf.read_header(vectors).reference
         truth, inside = _truth_of_particles(particles, reference.points_to_focal_point(field.grid.centres_mm()))
         if settings.validation.flow is None and settings.simulation.flow is None:
-            return Measured(field, truth, inside)
+            return of_methods.Measured(field, truth, inside)
         flow, true = settings.true_flow(), read_particles(particles)
         difference = flow(reference.points_from_focal_point(true.positions_mm)) - true.velocities_m_s
         if np.linalg.norm(difference) > SAME_FLOW * np.linalg.norm(true.velocities_m_s):
-            return Measured(field, truth, inside)
+            return of_methods.Measured(field, truth, inside)
         analytic = _at_windows(flow, field)
-        return Measured(field, analytic, inside & analytic.any(axis=-1), flow)
+        return of_methods.Measured(field, analytic, inside & analytic.any(axis=-1), flow)
     flow = settings.simulated_flow() if is_simulated else settings.true_flow()
     truth = _at_windows(flow, field)
-    return Measured(field, truth, np.asarray(truth.any(axis=-1)), flow)
+    return of_methods.Measured(field, truth, np.asarray(truth.any(axis=-1)), flow)
 
 
 def _at_windows(flow: Flow, field: VectorField) -> NDArray[np.float64]:

@@ -27,16 +27,8 @@ from lfpiv_cli.reconstruction.images import Image, Mask, light
 from lfpiv_cli.reconstruction.solvers import ALL_ITERATIONS, Reconstruction, reconstruct
 from lfpiv_cli.synthetic.board import BoardPlacement, dot_centres, render_board
 from lfpiv_cli.synthetic.scenes import RecordingCamera, simulate_board, simulate_white
-from lfpiv_cli.validation.board import (
-    DEPTHS_MM,
-    PAPER,
-    DotFigures,
-    board_figure,
-    board_figures,
-    measure_dots,
-    place_figures,
-)
-from lfpiv_cli.verbs.simulate import misalignment_of, readout_of
+from lfpiv_cli.validation import board as of_boards
+from lfpiv_cli.verbs.simulate import misalignment_of, placement_of, readout_of
 from lfpiv_cli.weights.build import factorise_through, scene_distortion
 from lfpiv_cli.weights.columns import operator_of
 from lfpiv_cli.weights.model import Weights
@@ -118,9 +110,11 @@ def validate_board(
                     continue
                 judged = bench if method == "ert" else bench.with_fitted_rays(pictures, depths)
                 dots, drawn = _boards(judged, pictures, depths, settings, console, advance)
-                measured = board_figures(dots, depths, bench.rig.board.dots, bench.rig.board.spacing_mm)
-                figures[half][method] = measured | {"paper": PAPER[half, method]}
-                write_picture(drawings[half, method], board_figure(measured, drawn, settings.grid()), overwrite)
+                measured = of_boards.board_figures(dots, depths, bench.rig.board.dots, bench.rig.board.spacing_mm)
+                figures[half][method] = measured | {"paper": of_boards.PAPER[half, method]}
+                write_picture(
+                    drawings[half, method], of_boards.board_figure(measured, drawn, settings.grid()), overwrite
+                )
     provenance = record("validate board", settings.resolved(), {"config": config})
     write_json(report, {"figures": figures, "provenance": provenance}, overwrite)
     return {
@@ -135,19 +129,13 @@ def validate_board(
 def depths_in_volume(settings: Config) -> tuple[float, ...]:
     """Return those of the paper's depths that lie in the volume (ConfigError: they are too few)."""
     low, high = settings.grid().bounds_mm(2)
-    depths = tuple(depth for depth in DEPTHS_MM if low < depth < high)
+    depths = tuple(depth for depth in of_boards.DEPTHS_MM if low < depth < high)
     if len(depths) < FEWEST_DEPTHS:
         raise ConfigError(
             f"{settings.source}: volume: reaches from z = {low:g} to {high:g} mm and holds {len(depths)} of the "
             f"boards, 1 mm apart each; expected at least {FEWEST_DEPTHS}"
         )
     return depths
-
-
-def placement_of(settings: Config, depth_mm: float) -> BoardPlacement:
-    """Return where the simulated board stands at a depth."""
-    scene = settings.simulation
-    return BoardPlacement(depth_mm, scene.board_offset_mm, scene.board_tilt_deg, scene.board_rotation_deg)
 
 
 def bench_of(settings: Config, half: str) -> BoardBench:
@@ -200,7 +188,7 @@ def _discs(
         places.append(dots_in_world(picture, rig.camera, rig.board, rig.media, rotation))
         advance(1)
     x, z = ([each[..., axis] for each in places] for axis in (0, 2))
-    return place_figures(x, z, depths_mm, rig.board.spacing_mm)
+    return of_boards.place_figures(x, z, depths_mm, rig.board.spacing_mm)
 
 
 def _boards(
@@ -210,7 +198,7 @@ def _boards(
     settings: Config,
     console: Console,
     advance: Callable[[int], None],
-) -> tuple[list[DotFigures], NDArray[np.float32]]:
+) -> tuple[list[of_boards.DotFigures], NDArray[np.float32]]:
     """Return what is measured of the boards in pictures at all depths, and the volume of the one in the focal plane."""
     board = settings.rig().board
     solve = board_solver(bench, settings)
@@ -219,7 +207,7 @@ def _boards(
         result = solve(picture, advance)
         volume = bench.weights.to_world(result.volume)
         centres = dot_centres(board, placement_of(settings, depth))[:, :2]
-        dots.append(measure_dots(volume, bench.weights.grid, centres, 0.5 * board.spacing_mm))
+        dots.append(of_boards.measure_dots(volume, bench.weights.grid, centres, 0.5 * board.spacing_mm))
         drawn = volume if depth == 0.0 else drawn
         console.detail(f"board at {depth:+z.0f} mm: residual {result.residual[-1]:z.3f}")
     return dots, drawn

@@ -215,11 +215,6 @@ def _strips(camera: Camera, source: Source, grid: Grid) -> float:
     return float(separates(camera, source, grid))
 
 
-def particles_core_s(tracers: float) -> float:
-    """Return what finding the particles of each image of so many tracers will take, in seconds of a core."""
-    return TRACER_S * tracers
-
-
 def held_bytes(voxels: int, pixels: int) -> float:
     """Return what a solver holds in memory besides the weights, for a volume, padding included, and an image."""
     return FLOAT_BYTES * (VOLUMES_HELD * voxels + IMAGES_HELD * pixels)
