@@ -33,7 +33,7 @@ from lfpiv_cli.flow.field import (
     derived_from,
     statistics_of,
 )
-from lfpiv_cli.flow.from_tracks import Paths, WindowGrid, without_tracks
+from lfpiv_cli.flow.from_tracks import Paths, WindowGrid, vectors_from_paths, without_tracks
 from lfpiv_cli.flow.windows import ParallelWalls
 from lfpiv_cli.names import Divergence
 from lfpiv_cli.notice import Notice
@@ -261,16 +261,6 @@ def samples_of_tracks(points: Points, frame: int | None = None) -> Samples:
     return Samples(points.position_mm, displacement, covariance, probability)
 
 
-def paths_of(tracks: Points) -> list[Paths]:
-    """Return the tracks of a pair, or those in each frame of a sequence, as paths from one frame to the next."""
-    frames = range(int(tracks.arrays["frame"].max(initial=-1)) + 1) if "frame" in tracks.arrays else [None]
-    every = [samples_of_tracks(tracks, frame) for frame in frames]
-    return [
-        Paths(each.points_mm, each.value_mm, np.sqrt(np.diagonal(each.covariance_mm2, axis1=1, axis2=2)))
-        for each in every
-    ]
-
-
 def samples_of_vectors(field: VectorField, name: str) -> Samples:
     """Return the vectors that are valid as samples at their windows' centres.
 
@@ -437,4 +427,10 @@ def _fields_in(path: Path) -> Iterator[VectorField]:
         return
     tracks = read_tracks(path)
     settings = carried_config(tracks.provenance, path)
-    yield from TracksOf(tracks, TRACKS_FORMAT, paths_of(tracks), {}, settings).fields()
+    windows = windows_of(settings, settings.masking_walls())
+    frames: Iterable[int | None] = [None]
+    if "frame" in tracks.arrays:
+        frames = range(int(tracks.arrays["frame"].max(initial=-1)) + 1)
+    for each in [samples_of_tracks(tracks, frame) for frame in frames]:
+        sigma_mm = np.sqrt(np.diagonal(each.covariance_mm2, axis1=1, axis2=2))
+        yield vectors_from_paths(Paths(each.points_mm, each.value_mm, sigma_mm), windows, settings.correlation.dt_s)

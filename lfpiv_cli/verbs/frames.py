@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,6 +47,7 @@ from lfpiv_cli.robust import HALF_NORMAL_MEDIAN, MAD_TO_SIGMA
 # Beyond so much the two are not the same.
 CONTRADICTING_SHARE = 0.01
 
+Found = TypeVar("Found")
 # Reads frame `number`: raw, and with dark or background taken off.
 Read = Callable[[int], tuple[Image, Image]]
 
@@ -140,7 +141,7 @@ def reader(
 
     @lru_cache(maxsize=1)
     def over(numbers: range) -> NDArray[np.float32]:
-        return BACKGROUNDS[level.kind or ""](_readable(page, numbers, keep_going))
+        return BACKGROUNDS[level.kind or ""](readable(page, numbers, keep_going))
 
     def read(number: int) -> tuple[Image, Image]:
         numbers = level.around(number, len(frames))
@@ -157,7 +158,7 @@ def read_frame(frame: Frame, shape: tuple[int, int]) -> Image:
     return image_files.read_page(frame.path, frame.page, shape)
 
 
-def _readable(read: Callable[[int], Image], numbers: Iterable[int], keep_going: bool) -> Iterator[Image]:
+def readable(read: Callable[[int], Found], numbers: Iterable[int], keep_going: bool) -> Iterator[Found]:
     """Yield images, those that cannot be read left out where the others are to go on."""
     for number in numbers:
         try:
@@ -177,7 +178,7 @@ def mask_of(
         return None
     if mask != STILL:
         return image_files.read_reference(Path(mask), shape)
-    images = _readable(lambda number: read_frame(frames[number], shape), range(len(frames)), keep_going)
+    images = readable(lambda number: read_frame(frames[number], shape), range(len(frames)), keep_going)
     still = still_light(images, pitch_px)
     return np.where(still, np.float32(0.0), np.float32(1.0))
 
@@ -225,18 +226,6 @@ def other_frames(level: Background, frames: Sequence[Frame], mask: str | Path | 
         return background + (f", mask: {STILL} {over(range(len(frames)))}" if mask == STILL else "")
 
     return words
-
-
-def beside_frames(
-    words: Callable[[int], str], frames: Sequence[Frame], beside: Sequence[tuple[int, ...]]
-) -> Callable[[int], str]:
-    """Return the function that says which frames help one, besides those of its own background and mask (`words`)."""
-
-    def alone(number: int) -> str:
-        frame = frames[number]
-        return f", beside page {frame.page}{words(number)} of SHA-256 {sha256(frame.path)}"
-
-    return lambda number: "".join([words(number), *(alone(k) for k in beside[number] if frames[k].fault is None)])
 
 
 Progress = Callable[[int], None]

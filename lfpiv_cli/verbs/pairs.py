@@ -119,15 +119,6 @@ def result_pairs(paths: Sequence[Path], options: PairOptions) -> Pairs:
     return _found(results_seen(paths), options)
 
 
-def sequence_of(paths: Sequence[Path]) -> tuple[list[int], list[Notice]]:
-    """Return files of particles in the order of time, by their names, and what is to be said of it.
-
-    Two are taken as they are given.
-    """
-    frames = results_seen(paths)
-    return ([0, 1], _doubts(frames)) if len(frames) == 2 else in_order(frames)
-
-
 def _found(frames: Sequence[Seen], options: PairOptions) -> Pairs:
     """Return which frames belong together: by a list, by names; without options two as they are given.
 
@@ -147,10 +138,10 @@ def _found(frames: Sequence[Seen], options: PairOptions) -> Pairs:
         raise UsageError(
             f"{len(frames)} frames need --pairing: ab for separate pairs or sequence for each with the next"
         )
-    return Pairs(((0, 1),), notices=tuple(_doubts(frames)))
+    return Pairs(((0, 1),), notices=tuple(doubts(frames)))
 
 
-def _doubts(frames: Sequence[Seen]) -> list[Notice]:
+def doubts(frames: Sequence[Seen]) -> list[Notice]:
     """Say of two frames that are taken as they are given where their names contradict it."""
     first, second = frames
     if (why := contradiction(first, second)) is not None:

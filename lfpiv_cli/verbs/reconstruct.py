@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -23,7 +23,7 @@ from lfpiv_cli.files.hdf5 import unpacked_bytes
 from lfpiv_cli.files.inputs import ensure_room
 from lfpiv_cli.files.pairing import Pairs
 from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, write_points
-from lfpiv_cli.files.provenance import Gone, also_used_as, record, with_warnings
+from lfpiv_cli.files.provenance import Gone, also_used_as, record, sha256, with_warnings
 from lfpiv_cli.files.vtkhdf import Volume
 from lfpiv_cli.files.weights_file import WeightsFile, read_weights_record
 from lfpiv_cli.names import Start
@@ -40,15 +40,14 @@ from lfpiv_cli.verbs.frames import (
     Bench,
     ImageOptions,
     Progress,
-    Read,
     bench_of,
-    beside_frames,
     check_frame,
     frame_notices,
     given_picture,
     mask_of,
     other_frames,
     picture_for,
+    readable,
     reader,
     residual_path,
 )
@@ -261,8 +260,8 @@ class Reconstruction(Batch[Outcome]):
         self._as_particles = solver == "particles"
         if self._beside is not None and not self._as_particles:
             raise UsageError(f"--pairing: {solver} takes each frame alone; --solver particles does not")
-        words = other_frames(options.level, frames, options.mask)
-        self._words = words if self._beside is None else beside_frames(words, frames, self._beside)
+        # Which other frames the background and mask of one are made from.
+        self._words = other_frames(options.level, frames, options.mask)
         self._resolved = self._settings.resolved()
         self.targets = [Target(path, partial(self._record, number)) for number, path in enumerate(self._paths)]
         with_residuals = self._as_particles and options.residual
@@ -313,7 +312,9 @@ class Reconstruction(Batch[Outcome]):
         read = reader(options.level, frames, shape, dark, options.keep_going)
         size, said = None, []
         if self._as_particles:
-            bench, size = particles.sized(bench, self._looked_at(bench, read))
+            # What cannot be read is told where its turn comes.
+            pictures = readable(read, range(len(frames)), keep_going=True)
+            bench, size = particles.sized(bench, (particles.frame_of(bench, *each) for each in pictures))
             said = size_notices(settings, size)
             console.warn(said)
         finder = Finder(bench, read, frames, self._beside, self._first_of, options.keep_going)
@@ -380,17 +381,11 @@ class Reconstruction(Batch[Outcome]):
         if frame.fault is not None:
             raise InputError(frame.fault)
         command = f"reconstruct page {frame.page}{self._words(number)}"
+        for k in () if self._beside is None else self._beside[number]:
+            if (beside := self._frames[k]).fault is None:
+                command += f", beside page {beside.page}{self._words(k)} of SHA-256 {sha256(beside.path)}"
         inputs = {**self._common, "image": frame.path}
         return record(command, self._resolved, inputs, {"image": frame.time_s}, self._gone)
-
-    def _looked_at(self, bench: Bench, read: Read) -> Iterator[particles.Frame]:
-        """Yield the frames that can be read."""
-        for number in range(len(self._frames)):
-            try:
-                pictures = read(number)
-            except InputError:
-                continue  # it is told where its turn comes
-            yield particles.frame_of(bench, *pictures)
 
 
 def file_notices(made: Mapping[str, Any], name: str) -> list[Notice]:

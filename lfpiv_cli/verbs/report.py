@@ -49,7 +49,6 @@ from lfpiv_cli.verbs.checks import (
     OF_IMAGES,
     Part,
     Reason,
-    Verdict,
     of_two_ways,
     of_vectors,
     of_warnings,
@@ -147,7 +146,15 @@ def report(
     fields = {path: open_vectors(path) for path in contents.of("vectors")[:LONGEST_TABLE]}
     # Those with the smallest stated errors first.
     fields = dict(sorted(fields.items(), key=lambda item: _sigma(item[1])))
-    judged = _verdicts(contents, fields)
+    reasons = [*of_warnings(contents.all_records), *_of_all_vectors(contents, fields)]
+    made_by = {verb_of(record) for record in contents.all_records.values()}
+    counted: list[tuple[Part, bool, str]] = [
+        ("calibration", not made_by.isdisjoint(CALIBRATES), "no calibration: lengths are as the data sheet has them"),
+        ("images", not made_by.isdisjoint(OF_IMAGES), "no volumes and no particles"),
+        ("vectors", bool(contents.of("vectors") or contents.of("tracks")), "no vectors and no tracks"),
+    ]
+    reasons += [Reason(part, "look", text) for part, there, text in counted if not there]
+    judged = verdicts(reasons, [part for part, _, _ in counted])
     words = {each.part: each.word for each in judged}
     advice = "Nothing speaks against these vectors, as far as images and vectors tell it themselves."
     if "no" in words.values():
@@ -231,19 +238,6 @@ class Drawer:
         self.count += 1
         write_picture(target, figure, overwrite=True)
         return Picture(target, caption)
-
-
-def _verdicts(contents: Contents, fields: Fields) -> list[Verdict]:
-    """Return what is thought of each part of the chain."""
-    reasons = [*of_warnings(contents.all_records), *_of_all_vectors(contents, fields)]
-    made = {verb_of(record) for record in contents.all_records.values()}
-    counted: list[tuple[Part, bool, str]] = [
-        ("calibration", not made.isdisjoint(CALIBRATES), "no calibration: lengths are as the data sheet has them"),
-        ("images", not made.isdisjoint(OF_IMAGES), "no volumes and no particles"),
-        ("vectors", bool(contents.of("vectors") or contents.of("tracks")), "no vectors and no tracks"),
-    ]
-    reasons += [Reason(part, "look", text) for part, there, text in counted if not there]
-    return verdicts(reasons, [part for part, _, _ in counted])
 
 
 def _of_all_vectors(contents: Contents, fields: Fields) -> list[Reason]:

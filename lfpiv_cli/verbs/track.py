@@ -14,11 +14,11 @@ import numpy as np
 
 from lfpiv_cli.console import CONSOLE, Console, Frames
 from lfpiv_cli.files import vtkhdf
-from lfpiv_cli.files.batch import Target, output_paths
+from lfpiv_cli.files.batch import Target, output_paths, results_seen
 from lfpiv_cli.files.config import Config
 from lfpiv_cli.files.hdf5 import fault_of
 from lfpiv_cli.files.inputs import given
-from lfpiv_cli.files.pairing import Pairs
+from lfpiv_cli.files.pairing import Pairs, in_order
 from lfpiv_cli.files.particle_file import (
     PARTICLES_FORMAT,
     TRAJECTORIES_FORMAT,
@@ -39,7 +39,7 @@ from lfpiv_cli.verbs.batches import Worked, dry_run, work_through
 from lfpiv_cli.verbs.checks import Quality, calibration_notices, few_notices, field_notices, quality_of, quality_of_all
 from lfpiv_cli.verbs.fields import fields_of
 from lfpiv_cli.verbs.frames import dt_notices
-from lfpiv_cli.verbs.pairs import PairBatch, PairBatchOptions, sequence_of
+from lfpiv_cli.verbs.pairs import PairBatch, PairBatchOptions, doubts
 from lfpiv_cli.verbs.tracks import (
     Lazy,
     Tracking,
@@ -162,7 +162,9 @@ class Tracks(PairBatch[Outcome, TrackOptions]):
             groups = self._paired(files, pairs)
             paths = output_paths(output, [group[0].stem for group in groups])
         else:
-            order, self.notices = sequence_of(files)
+            # In the order of time, by names; two are taken as they are given.
+            frames = results_seen(files)
+            order, self.notices = ([0, 1], doubts(frames)) if len(frames) == 2 else in_order(frames)
             groups, paths = [tuple(files[number] for number in order)], [output]
         ensure_frames(len(groups[0]), options.shortest)
         self._groups = groups
