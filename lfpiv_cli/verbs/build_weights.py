@@ -27,15 +27,7 @@ from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.curved_space import CurvedSpace
 from lfpiv_cli.optics.tracing import ObjectSpace, PolynomialRays
 from lfpiv_cli.reference import Reference
-from lfpiv_cli.verbs.weights_cost import (
-    check_rays,
-    check_rig,
-    cost_notices,
-    cost_of,
-    ensure_fits,
-    ensure_volume_fits,
-    rig_notices,
-)
+from lfpiv_cli.verbs import weights_cost
 from lfpiv_cli.weights.build import default_padding, scene_distortion
 from lfpiv_cli.weights.columns import ColumnOperator, OnDemandOperator, operator_of, seen_share
 from lfpiv_cli.weights.model import Weights, WeightsOperator
@@ -122,7 +114,7 @@ def plan_of(settings: Config, found: Calibration | None) -> Plan:
     ConfigError, InputError
         Rig and settings are not possible, or need another calibration.
     """
-    check_rig(settings, found)
+    weights_cost.check_rig(settings, found)
     camera = settings.camera_model()
     if found:
         camera = found.camera(camera)
@@ -140,11 +132,11 @@ def plan_of(settings: Config, found: Calibration | None) -> Plan:
     if not padding and isinstance(source, CurvedSpace):
         padding = curved_padding(camera, source, grid)
     padding = padding or default_padding(camera, settings.media_model(), grid)
-    check_rays(settings, source, grid.padded(padding))
+    weights_cost.check_rays(settings, source, grid.padded(padding))
     # What may lie out of view without a word.
     x, y, z = (-math.ceil(RIM_SHARE * n) if n > 2 else 0 for n in grid.shape_xyz)
     notices = [
-        *rig_notices(settings, found, camera, source, grid),
+        *weights_cost.rig_notices(settings, found, camera, source, grid),
         *_view_notices(*seen_share(camera, source, grid.padded((x, y, z))), grid),
         *_reach_notices(settings, found, grid),
     ]
@@ -317,7 +309,7 @@ def build_weights_file(
     found = read_calibration(options.calibration) if options.calibration else None
     settings = load_config(config).overridden_by("weights", options).with_scene_of(found)
     if not options.dry_run:
-        ensure_volume_fits(settings, by_volumes=False)
+        weights_cost.ensure_volume_fits(settings, by_volumes=False)
     plan = plan_of(settings, found)
     summary = {
         "voxels_xyz": list(plan.grid.shape_xyz),
@@ -330,11 +322,11 @@ def build_weights_file(
     made = record("build-weights", settings.resolved(), inputs)
     if options.resume and is_kept([output], made, inputs.values(), overwrite, resume=True):
         return summary | {"frame": open_weights(output).frame, "file_bytes": output.stat().st_size}
-    cost = cost_of(settings, plan.camera, plan.source, plan.grid.padded(plan.padding))
-    console.warn([*plan.notices, *cost_notices(cost)])
+    cost = weights_cost.cost_of(settings, plan.camera, plan.source, plan.grid.padded(plan.padding))
+    console.warn([*plan.notices, *weights_cost.cost_notices(cost)])
     if options.dry_run:
         return summary | cost.summary()
-    ensure_fits(cost, output)
+    weights_cost.ensure_fits(cost, output)
     console.detail(f"about {written(cost.weights_core_s, 2)} s of a core and {written(cost.weights_bytes / 1e9, 2)} GB")
     content = weights_of(plan, made, console)
     found_out = misfit_notices(content)

@@ -15,22 +15,13 @@ from numpy.typing import NDArray
 
 from lfpiv_cli.console import CONSOLE, Console, Frames
 from lfpiv_cli.errors import InputError, LfpivError, UsageError
-from lfpiv_cli.files import vtkhdf
+from lfpiv_cli.files import provenance, vtkhdf
 from lfpiv_cli.files.atomic import ensure_writable, folder_of
 from lfpiv_cli.files.batch import Target, output_paths
 from lfpiv_cli.files.config import Config, carried_config, load_config
 from lfpiv_cli.files.hdf5 import ensure_opens, fault_of
 from lfpiv_cli.files.inputs import ensure_room, given
 from lfpiv_cli.files.pairing import Pairs
-from lfpiv_cli.files.provenance import (
-    OF_FRAMES,
-    earlier_record,
-    ensure_agreement,
-    ensure_even,
-    record,
-    seconds_between,
-    with_warnings,
-)
 from lfpiv_cli.files.vtkhdf import Volume
 from lfpiv_cli.flow import correlation
 from lfpiv_cli.flow.correlation import correlate as measure
@@ -41,16 +32,8 @@ from lfpiv_cli.flow.windows import inside
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.notice import warn_of
 from lfpiv_cli.reference import FOCAL_POINT
+from lfpiv_cli.verbs import checks
 from lfpiv_cli.verbs.batches import ALL, BatchOptions, Expected, Failure, Worked, dry_run, work_through
-from lfpiv_cli.verbs.checks import (
-    Quality,
-    calibration_notices,
-    field_notices,
-    pair_notices,
-    quality_of,
-    quality_of_all,
-    window_notices,
-)
 from lfpiv_cli.verbs.fields import Mean, are_measured, arrays_of, mean_of_measured
 from lfpiv_cli.verbs.frames import dt_notices
 from lfpiv_cli.verbs.pairs import PairBatch, PairBatchOptions, coming_pairs, result_pairs, watched, work_as_they_come
@@ -104,9 +87,9 @@ def correlate(
     if config:
         # Of light that no camera recorded nothing is known.
         field = with_locking(field, first.reference, chosen.camera_model().scale(chosen.media_model()))
-    quality, name = quality_of(field), "the field"
-    against_field = [*field_notices(quality, name), *pair_notices(field, quality, name)]
-    warn_of([*window_notices(first, windows, "the first volume"), *against_field])
+    quality, name = checks.quality_of(field), "the field"
+    against_field = [*checks.field_notices(quality, name), *checks.pair_notices(field, quality, name)]
+    warn_of([*checks.window_notices(first, windows, "the first volume"), *against_field])
     return field
 
 
@@ -126,7 +109,7 @@ def ensure_alike(first: Volume, second: Volume, names: tuple[str, str]) -> None:
         raise InputError(f"{names[1]}: its grid {second.grid} differs from that of {names[0]}, {first.grid}")
     if first.reference.name != second.reference.name:
         raise InputError(f"{names[1]}: its coordinates have another origin than those of {names[0]}")
-    ensure_agreement([first.provenance, second.provenance], names, OF_FRAMES)
+    provenance.ensure_agreement([first.provenance, second.provenance], names, provenance.OF_FRAMES)
 
 
 def _as_volume(volume: Volume | NDArray[Any], voxel_mm: tuple[float, float, float] | None) -> Volume:
@@ -244,7 +227,7 @@ def _as_they_come(
 class Outcome:
     """What is told of a field: how good it is, how many vectors are rejected, and the divergence where it is asked."""
 
-    quality: Quality
+    quality: checks.Quality
     rejected: int
     divergence_rms: float | None = None
 
@@ -328,21 +311,23 @@ class Correlation(PairBatch[Outcome, CorrelateOptions]):
 
         usable = usable_voxels(config, first.grid, None if drawn is None else drawn.array)
         settings = config.correlation_settings(first.grid.spacing_mm)
-        of_volumes = {f"{role} {path.name}": earlier_record(path) or {} for role, path in self._volumes(number).items()}
-        notices = [*calibration_notices(of_volumes), *window_notices(first, settings, one.name)]
+        of_volumes = {
+            f"{role} {path.name}": provenance.earlier_record(path) or {} for role, path in self._volumes(number).items()
+        }
+        notices = [*checks.calibration_notices(of_volumes), *checks.window_notices(first, settings, one.name)]
         share = 1.0 / count_passes(settings.windows)
         field = measure(
             volumes(), first.grid, settings, mask=usable, progress=lambda passes: work.advance(share * passes)
         )
         camera, media = config.camera_model(), config.media_model()
         field = with_locking(field, first.reference, camera.scale(media))
-        quality, name = quality_of(field), target.path.name
+        quality, name = checks.quality_of(field), target.path.name
         records = ([self._record_of(path) for path in pair] for pair in pairs)
         notices += dt_notices(config.correlation.dt_s, records, name)
-        notices += [*field_notices(quality, name), *pair_notices(field, quality, name)]
+        notices += [*checks.field_notices(quality, name), *checks.pair_notices(field, quality, name)]
         work.console.warn(notices)
         derived = derived_fields(field) if self._options.derived else None
-        made = with_warnings(target.record, notices)
+        made = provenance.with_warnings(target.record, notices)
         extra = arrays_of(derived) if derived else None
         # What is complete is skipped: in the place of what is made there is nothing, or something broken.
         replacing = self.overwrite or self._options.resume
@@ -381,16 +366,18 @@ class Correlation(PairBatch[Outcome, CorrelateOptions]):
         settings = self._settings_of(group[0][0])
         if settings.correlation.dt_s is None:
             # Where the recordings of the frames of all pairs tell it: the same in all of them.
-            steps = [seconds_between(self._record_of(first), self._record_of(second)) for first, second in group]
+            steps = [
+                provenance.seconds_between(self._record_of(first), self._record_of(second)) for first, second in group
+            ]
             told = [step for step in steps if step is not None]
             names = [str(group[0][0]), str(group[-1][1])]
-            step_s = ensure_even(told, names) if told and len(told) == len(steps) else None
+            step_s = provenance.ensure_even(told, names) if told and len(told) == len(steps) else None
             settings = settings.overridden("correlation", dt_s=step_s)
         return settings
 
     def _record_of(self, volume: Path) -> Mapping[str, Any]:
         """Return the record of a volume, which may be gone."""
-        return self._gone[volume].record if volume in self._gone else earlier_record(volume) or {}
+        return self._gone[volume].record if volume in self._gone else provenance.earlier_record(volume) or {}
 
     def _settings_of(self, volume: Path) -> Config:
         """Return the settings for a volume: its own, or those of a config in their place."""
@@ -402,7 +389,7 @@ class Correlation(PairBatch[Outcome, CorrelateOptions]):
         options = self._options
         command = " ".join(["correlate", *["ensemble"] * options.ensemble, *["derived"] * options.derived])
         inputs = self._common | self._volumes(number)
-        return record(command, self._settings_for(number).resolved(), inputs, gone=self._gone)
+        return provenance.record(command, self._settings_for(number).resolved(), inputs, gone=self._gone)
 
 
 def field_bytes(settings: Config, grid: Grid, derived: bool = False) -> float:
@@ -414,7 +401,7 @@ def field_bytes(settings: Config, grid: Grid, derived: bool = False) -> float:
 def summary_of(worked: Worked[Outcome], pairs: int) -> dict[str, Any]:
     """Return what is told of the fields of so many pairs."""
     outcomes = list(worked.outcomes.values())
-    found = quality_of_all([outcome.quality for outcome in outcomes])
+    found = checks.quality_of_all([outcome.quality for outcome in outcomes])
     told: dict[str, Any] = {
         "pairs": pairs,
         "skipped": worked.skipped,

@@ -29,16 +29,7 @@ from lfpiv_cli.grid import Grid
 from lfpiv_cli.names import Divergence
 from lfpiv_cli.tracks.candidates import NO_TRACK, Trajectories
 from lfpiv_cli.tracks.in_time import Motion, high_derivatives_in, motions_at
-from lfpiv_cli.verbs.fields import (
-    Extra,
-    FittedField,
-    arrays_of,
-    ensure_one_time,
-    fit_notices,
-    fitted,
-    samples_of_tracks,
-    samples_of_vectors,
-)
+from lfpiv_cli.verbs import fields
 from lfpiv_cli.verbs.tracks import seen_in, settings_of, windows_of
 
 MM2_PER_M2 = 1e6
@@ -246,29 +237,29 @@ def fit_flow(
     for header, name in zip(headers, names, strict=True):
         if header.reference != headers[0].reference:
             raise InputError(f"{name}: its coordinates have another origin than those of {names[0]}")
-    ensure_one_time(header.attributes.get("dt_s") for header in headers)
+    fields.ensure_one_time(header.attributes.get("dt_s") for header in headers)
     settings = settings_of([header.provenance for header in headers], names, options.dt_s, OF_COORDINATES)
     pressed = _pressure(paths, settings, options)
     parts = [
-        samples_of_vectors(vtkhdf.open_vectors(path), str(path))
+        fields.samples_of_vectors(vtkhdf.open_vectors(path), str(path))
         if format_of(path) == vtkhdf.VECTORS_FORMAT
-        else samples_of_tracks(read_tracks(path), options.frame)
+        else fields.samples_of_tracks(read_tracks(path), options.frame)
         for path in paths
     ]
-    found = fitted(parts, settings, options.divergence, names[0])
-    notices = fit_notices(found.summary, options.divergence, paths[0].name)
+    found = fields.fitted(parts, settings, options.divergence, names[0])
+    notices = fields.fit_notices(found.summary, options.divergence, paths[0].name)
     console.warn(notices)
     inputs = {f"samples_{number:04d}": path for number, path in enumerate(paths)}
     inputs |= {f"particles_{number:04d}": path for number, path in enumerate(options.pressure)}
     chosen = {"divergence": options.divergence, "frame": options.frame, "derived": options.derived}
     made = with_warnings(record("field", settings.resolved() | {"field": chosen}, inputs), notices)
     vectors = found.vectors()
-    extra: Extra = {}
+    extra: fields.Extra = {}
     if options.derived:
         # What follows from the field's gradients, and these, row by row.
         gradients = found.gradients()
         flat = gradients.reshape(*gradients.shape[:3], 9)
-        extra = arrays_of(found.derived())
+        extra = fields.arrays_of(found.derived())
         extra |= {f"gradient_{name}": (flat[..., 3 * row : 3 * row + 3], "1/s") for row, name in enumerate("uvw")}
     if pressed is not None:
         extra |= {"pressure": (pressed.pressure_pa, "Pa"), "pressure_sigma": (pressed.pressure_sigma_pa, "Pa")}
@@ -331,7 +322,7 @@ def read_places(path: Path) -> NDArray[np.float64]:
     return np.array(rows)
 
 
-def _table(points: NDArray[np.float64], found: FittedField) -> str:
+def _table(points: NDArray[np.float64], found: fields.FittedField) -> str:
     """Return velocities and standard deviations at points as text."""
     rows = np.concatenate([points, found.at(points), found.sigma(points)], axis=1)
     lines = [",".join(repr(float(value)) for value in row) for row in rows]

@@ -44,18 +44,7 @@ from lfpiv_cli.files.vtkhdf import VECTORS_FORMAT, VOLUME_FORMAT, open_vectors, 
 from lfpiv_cli.flow.field import MASKED, REJECTED, VALID, VectorField
 from lfpiv_cli.notice import written
 from lfpiv_cli.pictures.points import MOST_LINES, has_views, lines_view, trajectory_lines
-from lfpiv_cli.verbs.checks import (
-    CALIBRATES,
-    OF_IMAGES,
-    Part,
-    Reason,
-    of_two_ways,
-    of_vectors,
-    of_warnings,
-    quality_of,
-    verb_of,
-    verdicts,
-)
+from lfpiv_cli.verbs import checks
 from lfpiv_cli.verbs.plot import figures_of
 
 if TYPE_CHECKING:
@@ -146,15 +135,19 @@ def report(
     fields = {path: open_vectors(path) for path in contents.of("vectors")[:LONGEST_TABLE]}
     # Those with the smallest stated errors first.
     fields = dict(sorted(fields.items(), key=lambda item: _sigma(item[1])))
-    reasons = [*of_warnings(contents.all_records), *_of_all_vectors(contents, fields)]
-    made_by = {verb_of(record) for record in contents.all_records.values()}
-    counted: list[tuple[Part, bool, str]] = [
-        ("calibration", not made_by.isdisjoint(CALIBRATES), "no calibration: lengths are as the data sheet has them"),
-        ("images", not made_by.isdisjoint(OF_IMAGES), "no volumes and no particles"),
+    reasons = [*checks.of_warnings(contents.all_records), *_of_all_vectors(contents, fields)]
+    made_by = {checks.verb_of(record) for record in contents.all_records.values()}
+    counted: list[tuple[checks.Part, bool, str]] = [
+        (
+            "calibration",
+            not made_by.isdisjoint(checks.CALIBRATES),
+            "no calibration: lengths are as the data sheet has them",
+        ),
+        ("images", not made_by.isdisjoint(checks.OF_IMAGES), "no volumes and no particles"),
         ("vectors", bool(contents.of("vectors") or contents.of("tracks")), "no vectors and no tracks"),
     ]
-    reasons += [Reason(part, "look", text) for part, there, text in counted if not there]
-    judged = verdicts(reasons, [part for part, _, _ in counted])
+    reasons += [checks.Reason(part, "look", text) for part, there, text in counted if not there]
+    judged = checks.verdicts(reasons, [part for part, _, _ in counted])
     words = {each.part: each.word for each in judged}
     advice = "Nothing speaks against these vectors, as far as images and vectors tell it themselves."
     if "no" in words.values():
@@ -240,26 +233,26 @@ class Drawer:
         return Picture(target, caption)
 
 
-def _of_all_vectors(contents: Contents, fields: Fields) -> list[Reason]:
+def _of_all_vectors(contents: Contents, fields: Fields) -> list[checks.Reason]:
     """Return what vectors say of themselves and of each other.
 
     What speaks against vectors that better ones by another command stand beside is told, and not counted.
     """
     by_command: dict[str, list[Path]] = {}
     for path in fields:
-        by_command.setdefault(verb_of(contents.record(path)), []).append(path)
-    reasons: list[Reason] = []
+        by_command.setdefault(checks.verb_of(contents.record(path)), []).append(path)
+    reasons: list[checks.Reason] = []
     for number, paths in enumerate(by_command.values()):
-        found = [each for path in paths for each in of_vectors(fields[path], path.name)]
+        found = [each for path in paths for each in checks.of_vectors(fields[path], path.name)]
         against = [each for each in found if each.word != "good"]
         reasons += [replace(each, word="good") if number else each for each in against[:MOST_FIELDS]]
         if len(against) > MOST_FIELDS:
             text = f"{len(against) - MOST_FIELDS} more reasons like these in other files"
-            reasons.append(Reason("vectors", "good" if number else "look", text))
+            reasons.append(checks.Reason("vectors", "good" if number else "look", text))
         reasons += [each for each in found if each.word == "good"][:1]
     if all(len(paths) == 1 for paths in by_command.values()):
         for one, other in combinations(fields, 2):
-            reasons += of_two_ways(fields[one], fields[other], (one.name, other.name))
+            reasons += checks.of_two_ways(fields[one], fields[other], (one.name, other.name))
     return reasons
 
 
@@ -301,7 +294,7 @@ def _chain(contents: Contents, fields: Fields, drawer: Drawer) -> Iterable[Secti
 
 def _sigma(field: VectorField) -> float:
     """Return the size of the usual stated error of vectors, mm; infinite where none is stated."""
-    sigma = quality_of(field).summary()["uncertainty_voxel_median"]
+    sigma = checks.quality_of(field).summary()["uncertainty_voxel_median"]
     return float("inf") if sigma is None else float(np.linalg.norm(np.multiply(sigma, field.voxel_mm)))
 
 
@@ -346,7 +339,7 @@ def _with_error(told: Mapping[str, Any], name: str, unit: str) -> str:
 
 
 def _field_row(vectors: VectorField) -> Row:
-    quality, there, used = quality_of(vectors), vectors.flag < REJECTED, vectors.flag < MASKED
+    quality, there, used = checks.quality_of(vectors), vectors.flag < REJECTED, vectors.flag < MASKED
     moved = vectors.displacement_voxel[there]
     return {
         "vectors": str(quality.used),

@@ -13,30 +13,20 @@ from typing import Any
 import numpy as np
 
 from lfpiv_cli.console import CONSOLE, Console, Frames
-from lfpiv_cli.files import vtkhdf
+from lfpiv_cli.files import particle_file, vtkhdf
 from lfpiv_cli.files.batch import Target, output_paths, results_seen
 from lfpiv_cli.files.config import Config
 from lfpiv_cli.files.hdf5 import fault_of
 from lfpiv_cli.files.inputs import given
 from lfpiv_cli.files.pairing import Pairs, in_order
-from lfpiv_cli.files.particle_file import (
-    PARTICLES_FORMAT,
-    TRAJECTORIES_FORMAT,
-    Points,
-    StoredTracks,
-    TrackStore,
-    read_points,
-    read_tracks,
-    write_points,
-)
 from lfpiv_cli.files.provenance import carried_record, record, with_warnings
 from lfpiv_cli.flow.field import REJECTED
 from lfpiv_cli.names import GridMethod
 from lfpiv_cli.reference import Reference
 from lfpiv_cli.tracks.candidates import Seen, Trajectories
 from lfpiv_cli.tracks.sequences import HALVES_FRAMES
+from lfpiv_cli.verbs import checks
 from lfpiv_cli.verbs.batches import Worked, dry_run, work_through
-from lfpiv_cli.verbs.checks import Quality, calibration_notices, few_notices, field_notices, quality_of, quality_of_all
 from lfpiv_cli.verbs.fields import fields_of
 from lfpiv_cli.verbs.frames import dt_notices
 from lfpiv_cli.verbs.pairs import PairBatch, PairBatchOptions, doubts
@@ -60,7 +50,7 @@ KEPT_FRAMES = 2 * max(HALVES_FRAMES) + 1
 class SeenFrames(Lazy[Seen]):
     """The particles of a sequence's frames, read when they are asked for; the last few stay in memory."""
 
-    def __init__(self, count: int, read: Callable[[int], Points]) -> None:
+    def __init__(self, count: int, read: Callable[[int], particle_file.Points]) -> None:
         """Take how many frames there are, and what reads one."""
         super().__init__(count, lru_cache(KEPT_FRAMES)(self._seen))
         self._read = read
@@ -85,7 +75,7 @@ def stored_tracks(
     provenance: Mapping[str, Any],
     folder: Path,
     found: Trajectories | None = None,
-) -> Iterator[TracksOf[StoredTracks]]:
+) -> Iterator[TracksOf[particle_file.StoredTracks]]:
     """Yield the tracks of a sequence, whose places lie in a folder for as long; as `tracked` in memory.
 
     Raises
@@ -93,11 +83,11 @@ def stored_tracks(
     OutputError : there is no room in the folder
     """
     sequence = tracks_through(frames, chosen, found)
-    with TrackStore(folder) as store:
+    with particle_file.TrackStore(folder) as store:
         for number in range(len(frames)):
             store.put(sequence.at(number))
-        points = StoredTracks(store, reference, chosen.attributes(reference), dict(provenance))
-        yield TracksOf(points, TRAJECTORIES_FORMAT, sequence.paths, sequence.summary(), settings)
+        points = particle_file.StoredTracks(store, reference, chosen.attributes(reference), dict(provenance))
+        yield TracksOf(points, particle_file.TRAJECTORIES_FORMAT, sequence.paths, sequence.summary(), settings)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -144,7 +134,7 @@ class Outcome:
     """What is told of tracks: their figures, and how good the vectors of each interval are."""
 
     figures: dict[str, Any]
-    qualities: Sequence[Quality]
+    qualities: Sequence[checks.Quality]
     rejected: int
 
 
@@ -183,7 +173,7 @@ class Tracks(PairBatch[Outcome, TrackOptions]):
         target, paths = self.targets[number], self._groups[number]
         names = [str(path) for path in paths]
         # A pair is read once; of a sequence all that is kept of a frame is its record.
-        read = lru_cache(maxsize=2)(partial(read_points, format_name=PARTICLES_FORMAT))
+        read = lru_cache(maxsize=2)(partial(particle_file.read_points, format_name=particle_file.PARTICLES_FORMAT))
         counts, records = zip(*((frame.count, frame.provenance) for frame in map(read, paths)), strict=True)
         ensure_particles(counts, names)
         settings = settings_of(records, names, self._options.dt_s)
@@ -192,22 +182,22 @@ class Tracks(PairBatch[Outcome, TrackOptions]):
             roles = zip(_roles(paths).items(), records, strict=True)
             told = {f"{role} {path.name}": made for (role, path), made in roles}
             doubts = dt_notices(chosen.dt_s, pairwise(records), paths[0].name)
-            few = few_notices(counts, [path.name for path in paths], found.summary, found.points)
-            notices = [*doubts, *calibration_notices(told), *few]
+            few = checks.few_notices(counts, [path.name for path in paths], found.summary, found.points)
+            notices = [*doubts, *checks.calibration_notices(told), *few]
             work.console.warn(notices)
             provenance = with_warnings(found.points.provenance, notices)
             # What is complete is skipped: in the place of what is made there is nothing, or something broken.
             replacing = self.overwrite or self._options.resume
             points = replace(found.points, provenance=provenance)
-            write_points(target.path, found.format_name, points, overwrite=replacing)
+            particle_file.write_points(target.path, found.format_name, points, overwrite=replacing)
             if self._options.by == "polynomials":
                 fields = found.fields()
             else:
                 fields = (each.vectors() for each in fields_of(found, names[0]))
             qualities, rejected = [], 0
             for path, field in zip(target.beside, fields if target.beside else (), strict=True):
-                quality = quality_of(field)
-                notices = list(field_notices(quality, path.name))
+                quality = checks.quality_of(field)
+                notices = list(checks.field_notices(quality, path.name))
                 work.console.warn(notices)
                 made = with_warnings(points.provenance, notices)
                 vtkhdf.write_vectors(path, field, points.reference, provenance=made, overwrite=replacing)
@@ -243,7 +233,7 @@ def summary_of(worked: Worked[Outcome], paths: Sequence[Path]) -> dict[str, Any]
         told = outcomes[0].figures if outcomes else {"tracks": 0}
         if not outcomes and paths[0].exists():
             # Of two frames, or of a sequence, which has a place for each frame of a track.
-            points = read_tracks(paths[0])
+            points = particle_file.read_tracks(paths[0])
             number = points.arrays.get("track")
             told = {"tracks": len(points.position_mm) if number is None else len(np.unique(number))}
     else:
@@ -252,7 +242,7 @@ def summary_of(worked: Worked[Outcome], paths: Sequence[Path]) -> dict[str, Any]
     qualities = [quality for outcome in outcomes for quality in outcome.qualities]
     if not qualities:
         return told
-    every = quality_of_all(qualities)
+    every = checks.quality_of_all(qualities)
     rejected = sum(outcome.rejected for outcome in outcomes)
     return told | {"vectors": every.vectors, "rejected": rejected} | every.summary()
 
@@ -273,7 +263,7 @@ def _roles(particles: Sequence[Path]) -> dict[str, Path]:
 @contextmanager
 def _tracks(
     paths: Sequence[Path],
-    read: Callable[[Path], Points],
+    read: Callable[[Path], particle_file.Points],
     settings: Config,
     chosen: Tracking,
     made: dict[str, Any],

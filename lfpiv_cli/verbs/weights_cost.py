@@ -18,17 +18,10 @@ from lfpiv_cli.files.inputs import ensure_disk, ensure_room
 from lfpiv_cli.files.weights_fields import BYTES_A_VOXEL
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.notice import Notice, written
+from lfpiv_cli.optics import tracing
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.curved_space import CurvedSpace
 from lfpiv_cli.optics.media import Media
-from lfpiv_cli.optics.tracing import (
-    LARGEST_ERROR_PX,
-    ObjectSpace,
-    PolynomialRays,
-    refraction_error_mm,
-    rim_tangent,
-    sine_error_mm,
-)
 from lfpiv_cli.weights.build import separates, strips_of
 from lfpiv_cli.weights.columns import LARGEST_BYTES
 from lfpiv_cli.weights.quadrature import RayCount
@@ -53,10 +46,10 @@ def check_rig(settings: Config, found: Calibration | None) -> None:
     check_f_numbers(sheet)
     if found is not None:
         check_pitch(found.fit, settings.micro_image_pitch_px())
-    if settings.weights.method != "dlfc" and rim_tangent(sheet) > LARGEST_TANGENT:
+    if settings.weights.method != "dlfc" and tracing.rim_tangent(sheet) > LARGEST_TANGENT:
         raise ConfigError(
-            f"camera.main_lens.aperture_mm: the rim of the lens is seen under a tangent of {rim_tangent(sheet):.2f} "
-            f"(NA {_na(sheet):.2f}) from the focal point, at most {LARGEST_TANGENT:g} may be with traced rays; boards "
+            f"camera.main_lens.aperture_mm: the rim of the lens is seen under a tangent of "
+            f"{tracing.rim_tangent(sheet):.2f} (NA {_na(sheet):.2f}) from the focal point, at most {LARGEST_TANGENT:g} may be with traced rays; boards "
             "at several depths and weights.method: dlfc fit the rays of such an objective"
         )
 
@@ -69,43 +62,48 @@ def rig_notices(
     depths = np.linspace(*grid.bounds_mm(2), DEPTHS)
     if isinstance(source, CurvedSpace):
         return [*notices, *_of_sines(camera, source.media, seen_depths_mm(camera, source, grid))]
-    if not isinstance(source, ObjectSpace):
+    if not isinstance(source, tracing.ObjectSpace):
         return notices
     if source.refraction != "exact" and source.media != source.media.in_air():
         try:
             window = settings.window_model(found.mid_plane_z_mm if found else None)
         except ConfigError:
             window = None
-        error_px = refraction_error_mm(camera, source.media, window, depths) / camera.pixel_mm
-        if error_px > LARGEST_ERROR_PX:
+        error_px = tracing.refraction_error_mm(camera, source.media, window, depths) / camera.pixel_mm
+        if error_px > tracing.LARGEST_ERROR_PX:
             text = (
                 "is paraxial, and Snell's law moves light at the rim of the aperture by "
                 f"{'' if window else 'at least '}{written(error_px, 2)} px on the array, at most "
-                f"{LARGEST_ERROR_PX:g} px without harm"
+                f"{tracing.LARGEST_ERROR_PX:g} px without harm"
             )
             remedy = "--refraction exact" if window else "give the section window, or channel, and --refraction exact"
-            limit = f"at most {LARGEST_ERROR_PX:g} px"
+            limit = f"at most {tracing.LARGEST_ERROR_PX:g} px"
             notices.append(Notice("paraxial-refraction", "weights.refraction", text, remedy, error_px, limit))
     return [*notices, *_of_sines(camera, source.media, depths)]
 
 
 def _of_sines(camera: Camera, media: Media, depths: NDArray[np.float64]) -> Iterator[Notice]:
-    error_px = sine_error_mm(camera, media, depths) / camera.pixel_mm
-    if error_px <= LARGEST_ERROR_PX:
+    error_px = tracing.sine_error_mm(camera, media, depths) / camera.pixel_mm
+    if error_px <= tracing.LARGEST_ERROR_PX:
         return
     text = (
         f"NA {_na(camera):.2f}: the rays of a thin lens are off by {written(error_px, 2)} px on the array at the "
-        f"volume's faces, at most {LARGEST_ERROR_PX:g} px without harm; depths will be wrong"
+        f"volume's faces, at most {tracing.LARGEST_ERROR_PX:g} px without harm; depths will be wrong"
     )
     remedy = "a smaller aperture or a thinner volume, or boards at several depths and weights.method: dlfc"
     yield Notice(
-        "paraxial-lens", "camera.main_lens.aperture_mm", text, remedy, error_px, f"at most {LARGEST_ERROR_PX:g} px"
+        "paraxial-lens",
+        "camera.main_lens.aperture_mm",
+        text,
+        remedy,
+        error_px,
+        f"at most {tracing.LARGEST_ERROR_PX:g} px",
     )
 
 
 def _na(camera: Camera) -> float:
     """Return the numerical aperture towards the scene, in air."""
-    tangent = rim_tangent(camera)
+    tangent = tracing.rim_tangent(camera)
     return float(tangent / np.hypot(1.0, tangent))
 
 
@@ -239,7 +237,7 @@ def check_rays(settings: Config, source: Source, grid: Grid) -> None:
 def _rays(settings: Config, source: Source, grid: Grid) -> int:
     """Return how many rays are to be counted for a grid, 0 where weights are integrals."""
     chosen = settings.weights
-    if chosen.sampling == "exact" or isinstance(source, PolynomialRays):
+    if chosen.sampling == "exact" or isinstance(source, tracing.PolynomialRays):
         return 0
     return math.prod(grid.shape_xyz) * RayCount(chosen.points, chosen.rays_per_point).rays
 
