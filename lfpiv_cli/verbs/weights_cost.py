@@ -48,9 +48,10 @@ def check_rig(settings: Config, found: Calibration | None) -> None:
         check_pitch(found.fit, settings.micro_image_pitch_px())
     if settings.weights.method != "dlfc" and tracing.rim_tangent(sheet) > LARGEST_TANGENT:
         raise ConfigError(
-            f"camera.main_lens.aperture_mm: the rim of the lens is seen under a tangent of "
-            f"{tracing.rim_tangent(sheet):.2f} (NA {_na(sheet):.2f}) from the focal point, at most {LARGEST_TANGENT:g} may be with traced rays; boards "
-            "at several depths and weights.method: dlfc fit the rays of such an objective"
+            "camera.main_lens.aperture_mm: the rim of the lens is seen under a tangent of "
+            f"{tracing.rim_tangent(sheet):.2f} (NA {_na(sheet):.2f}) from the focal point, at most {LARGEST_TANGENT:g} "
+            "may be with traced rays; boards at several depths and weights.method: dlfc fit the rays of such an "
+            "objective"
         )
 
 
