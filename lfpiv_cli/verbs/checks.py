@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.calibration.light_checks import MOST_SATURATED
 from lfpiv_cli.files.atomic import without_nan
 from lfpiv_cli.files.particle_file import PointRows
@@ -77,7 +78,7 @@ class Quality:
     in_doubt: int
     finite: int
     without: int
-    sigma: NDArray[np.float64]
+    sigma: Floats
 
     def summary(self) -> dict[str, Any]:
         """Return the figures, units in their names; None where there are no vectors, or none with an uncertainty."""

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lfpiv_cli.arrays import Floats
 from lfpiv_cli.console import CONSOLE, Console
@@ -299,7 +298,7 @@ def _counts(vectors: VectorField) -> dict[str, Any]:
     }
 
 
-def read_places(path: Path) -> NDArray[np.float64]:
+def read_places(path: Path) -> Floats:
     """Read points (n, 3), mm: x, y, z in a line, by commas; lines that begin with a letter or # are passed over.
 
     Raises
@@ -322,7 +321,7 @@ def read_places(path: Path) -> NDArray[np.float64]:
     return np.array(rows)
 
 
-def _table(points: NDArray[np.float64], found: fields.FittedField) -> str:
+def _table(points: Floats, found: fields.FittedField) -> str:
     """Return velocities and standard deviations at points as text."""
     rows = np.concatenate([points, found.at(points), found.sigma(points)], axis=1)
     lines = [",".join(repr(float(value)) for value in row) for row in rows]

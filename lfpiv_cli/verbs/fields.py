@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.console import Console, Frames
 from lfpiv_cli.errors import InputError, UsageError
 from lfpiv_cli.fields import fit, turbulence
@@ -68,19 +69,19 @@ class FittedField:
 
     field: fit.Field
     windows: WindowGrid
-    middles_mm: NDArray[np.float64]
+    middles_mm: Floats
     dt_s: float
     summary: dict[str, Any]
 
-    def at(self, points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+    def at(self, points_mm: Floats) -> Floats:
         """Return velocities (m, 3) at points, m/s."""
         return self.field.value_at(points_mm) * (MM_TO_M / self.dt_s)
 
-    def sigma(self, points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+    def sigma(self, points_mm: Floats) -> Floats:
         """Return the velocities' standard deviations (m, 3), m/s."""
         return np.asarray(np.sqrt(self.field.variance_at(points_mm)) * (MM_TO_M / self.dt_s))
 
-    def gradient(self, points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+    def gradient(self, points_mm: Floats) -> Floats:
         """Return the velocities' gradients (m, 3, 3), 1/s: the component, then the direction."""
         return self.field.gradient_at(points_mm) / self.dt_s
 
@@ -88,7 +89,7 @@ class FittedField:
         """Return what follows from the field's own gradients at the windows' centres."""
         return derived_from(self.gradients())
 
-    def gradients(self) -> NDArray[np.float64]:
+    def gradients(self) -> Floats:
         """Return the gradients (nz, ny, nx, 3, 3) at the windows' centres, 1/s; NaN where there is no vector."""
         grid = self.windows.centres
         gradient = self.gradient(grid.centres_mm().reshape(-1, 3)).reshape(*grid.shape_zyx, 3, 3)

@@ -9,6 +9,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.errors import UsageError
 from lfpiv_cli.files.config import carried_config
 from lfpiv_cli.files.particle_file import Points
@@ -286,7 +287,7 @@ def _next(
     return result(task, first_pass(task)), [Notice("frame-apart", name, text, remedy, None, "a sequence")]
 
 
-def _rows(bench: Bench, position_mm: NDArray[np.float64], light_counts: NDArray[np.float64]) -> NDArray[np.float64]:
+def _rows(bench: Bench, position_mm: Floats, light_counts: Floats) -> Floats:
     """Return particles in the coordinates of files as rows (n, 4) in image axes."""
     from_focal_point = bench.content.reference.points_to_focal_point(position_mm)
     return np.column_stack([bench.content.camera.to_image_axes(from_focal_point), light_counts])

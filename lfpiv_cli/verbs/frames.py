@@ -18,6 +18,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.calibration import light_checks
 from lfpiv_cli.calibration.lens_light import LensImages
 from lfpiv_cli.calibration.rectification import Rectification
@@ -260,7 +261,7 @@ class Bench:
     excluded: Mask
     sums: Normalisers | None
     lens_images: LensImages
-    light_covariance: NDArray[np.float64] | None = None
+    light_covariance: Floats | None = None
 
     def unusable(self, raw: Image) -> Mask:
         """Return which pixels of a raw frame take no part."""

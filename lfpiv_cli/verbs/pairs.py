@@ -238,10 +238,7 @@ def work_as_they_come(
 
 
 def coming_pairs(
-    coming: Iterable[Sequence[Path]],
-    pair: Callable[[Sequence[Path]], Pairs],
-    console: Console,
-    left_out: list[Failure],
+    coming: Iterable[Sequence[Path]], pair: Callable[[Sequence[Path]], Pairs], console: Console, left_out: list[Failure]
 ) -> Iterator[list[Path]]:
     """Yield the files of pairs that are complete, two by two, as they come.
 

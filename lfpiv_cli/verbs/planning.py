@@ -14,6 +14,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.calibration.model import Calibration
 from lfpiv_cli.calibration.sheet import LARGE_F_RATIO, LARGEST_F_RATIO
 from lfpiv_cli.errors import ConfigError, InputError
@@ -110,18 +111,18 @@ class Bench:
         return (self.found.mid_plane_z_mm if self.found else None) or 0.0
 
     @property
-    def bounds_mm(self) -> NDArray[np.float64]:
+    def bounds_mm(self) -> Floats:
         """(3, 2) of the volume, z from the focal point."""
         return np.array([self.grid.bounds_mm(axis) for axis in range(3)])
 
     @property
-    def depths_mm(self) -> NDArray[np.float64]:
+    def depths_mm(self) -> Floats:
         """Depths of the volume, from the focal point."""
         count = DEPTHS if self.settings.reconstruction.wavelength_nm is None else DEPTHS_BY_WAVES
         return np.linspace(self.bounds_mm[2, 0], self.bounds_mm[2, 1], count)
 
     @property
-    def sides_mm(self) -> NDArray[np.float64]:
+    def sides_mm(self) -> Floats:
         """(3,) of the volume."""
         return np.diff(self.bounds_mm)[:, 0]
 
@@ -131,11 +132,11 @@ class Bench:
         return self.settings.correlation_settings(self.grid.spacing_mm).layout(self.grid.shape_xyz)
 
     @cached_property
-    def errors_mm(self) -> NDArray[np.float64]:
+    def errors_mm(self) -> Floats:
         """Smallest errors (n, 3) of simulated tracers at `depths_mm`."""
         return self.errors_of(self.tracer())
 
-    def errors_of(self, tracer: Tracer) -> NDArray[np.float64]:
+    def errors_of(self, tracer: Tracer) -> Floats:
         """Return the smallest errors (n, 3) of a tracer at `depths_mm`, beyond what can be refocused of its end."""
         seen, places = self.seen
         return planning.errors_by_depth_mm(seen, tracer)[places]
@@ -237,7 +238,7 @@ def rig_figures(bench: Bench) -> dict[str, Any]:
     return figures
 
 
-def by_depth(bench: Bench) -> dict[str, NDArray[np.float64]]:
+def by_depth(bench: Bench) -> dict[str, Floats]:
     """Return errors and fields of view by depth, for a picture."""
     depths, camera, media = bench.depths_mm, bench.camera, bench.media
     return {

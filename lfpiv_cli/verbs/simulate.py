@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.calibration.board_pose import BoardGeometry
 from lfpiv_cli.calibration.model import mid_plane_z_mm
 from lfpiv_cli.console import CONSOLE, Console
@@ -206,7 +206,7 @@ def simulate_particles(
     tracers = tracers_of(settings, camera.optics, reference, motion)
     walls = bubbles_walls_of(settings, reference)
     bubbles: Bubbles | None = None
-    still: NDArray[np.float64] | float = 0.0
+    still: Floats | float = 0.0
     if walls is not None:
         rng = _generator(settings, 4)
         bubbles = bubbles_at_wall(scene.bubbles, scene.bubble_diameter_mm, scene.bubble_wall, tracers.box, walls, rng)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.console import CONSOLE, Console
 from lfpiv_cli.errors import ConfigError, InputError, LimitMissedError, UsageError
 from lfpiv_cli.files import vtkhdf
@@ -239,7 +240,7 @@ def measured_of(vectors: Path, settings: Config, particles: Path | None, is_simu
     return of_methods.Measured(field, truth, np.asarray(truth.any(axis=-1)), flow)
 
 
-def _at_windows(flow: Flow, field: VectorField) -> NDArray[np.float64]:
+def _at_windows(flow: Flow, field: VectorField) -> Floats:
     centres = field.grid.centres_mm()
     return flow(centres.reshape(-1, 3)).reshape(centres.shape)
 
@@ -266,7 +267,7 @@ def _summary(figures: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
     return {name: {method: found[name] for method, found in figures.items()} for name in names}
 
 
-def _truth_of_particles(path: Path, centres_mm: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+def _truth_of_particles(path: Path, centres_mm: Floats) -> tuple[Floats, NDArray[np.bool_]]:
     """Return the true velocities at the window centres, z from the focal point, and which lie among the particles."""
     particles = read_particles(path)
     lit = particles.brightness[:, np.newaxis] > 0.0

@@ -8,8 +8,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.calibration.model import Calibration
 from lfpiv_cli.calibration.sheet import check_f_numbers, check_pitch, f_number_notices
 from lfpiv_cli.errors import ConfigError
@@ -83,7 +83,7 @@ def rig_notices(
     return [*notices, *_of_sines(camera, source.media, depths)]
 
 
-def _of_sines(camera: Camera, media: Media, depths: NDArray[np.float64]) -> Iterator[Notice]:
+def _of_sines(camera: Camera, media: Media, depths: Floats) -> Iterator[Notice]:
     error_px = tracing.sine_error_mm(camera, media, depths) / camera.pixel_mm
     if error_px <= tracing.LARGEST_ERROR_PX:
         return
