@@ -99,7 +99,7 @@ def run(
     chain = Chain(config, options, frames, pairs, steps, prepared, overwrite)
 
     def choose(weights: Path) -> Choice:
-        return _chosen(settings, options, lambda: _counted(settings, options, weights, frames, prepared, steps))
+        return _chosen(settings, options, lambda: _counted(settings, chain, weights))
 
     def methods(weights: Path) -> tuple[FlowMethod, ...]:
         return choose(weights).methods
@@ -263,10 +263,9 @@ def _chosen(settings: Config, options: RunOptions, count_tracers: Callable[[], f
     return Choice((asked,), f"as asked for; but there are {reason}", count)
 
 
-def _counted(
-    settings: Config, options: RunOptions, weights: Path, frames: Sequence[Frame], prepared: Prepared, steps: Steps
-) -> float | None:
+def _counted(settings: Config, chain: Chain, weights: Path) -> float | None:
     """Return how many tracers for each microlens the first image holds, as the run before has counted if it could."""
+    options, frames, steps = chain.options, chain.frames, chain.steps
     shape, level = settings.image_shape(), options.level
     first = _first_readable(frames, shape, options.keep_going)
     files = (weights, frames[first].path, *filter(None, (options.dark, level.path)))
@@ -276,11 +275,11 @@ def _counted(
     steps.told["counted_from"] = hashlib.sha256(counted_from.encode()).hexdigest()
     if steps.earlier.get("counted_from") == steps.told["counted_from"] and "tracers_per_lens" in steps.earlier:
         return cast("float | None", steps.earlier["tracers_per_lens"])
-    content = prepared.searchable(weights, settings)
+    content = chain.prepared.searchable(weights, settings)
     shape = content.image_shape
     dark = options.dark_image(shape)
     # What stands still would take a look at every image, and a pair hardly shows it better than one counts without.
-    bench = prepared.bench(content, settings, dark, mask_of(options.mask_file, frames, shape, 0.0))
+    bench = chain.prepared.bench(content, settings, dark, mask_of(options.mask_file, frames, shape, 0.0))
     read = reader(level, frames, shape, dark, options.keep_going)
     return particles.tracers_per_lens(bench, particles.frame_of(bench, *read(first)))
 

@@ -234,7 +234,7 @@ class Chain:
         self.order = list(dict.fromkeys([*(k for pair in ours for k in pair), *(alone if shard.is_last else [])]))
         # Of several shards the first one tells them.
         self.failures = failures_of(pairs) if shard.number == 1 else []
-        self._prepared, self._overwrite = prepared, overwrite
+        self.prepared, self._overwrite = prepared, overwrite
         self.pairs = replace(pairs, left_out=())
 
     @property
@@ -299,7 +299,7 @@ class Chain:
         chosen = replace(PARTICLES, residual=kept) if by_particles else VOLUMES
         options = replace(chosen, **self._of_images, **self._resuming)
         given = (weights, self.options.images, self.steps.output / method, options, self._overwrite)
-        return Reconstruction(*given, self.pairs if by_particles else None, self._prepared, self.order, to_come)
+        return Reconstruction(*given, self.pairs if by_particles else None, self.prepared, self.order, to_come)
 
     def vectors_by(self, method: FlowMethod, weights: Path) -> Vectors:
         """Measure the flow by volumes or by particles; return the files of vectors, none where tracks are all."""
