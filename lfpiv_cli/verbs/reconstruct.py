@@ -288,23 +288,26 @@ class Reconstruction(Batch[Outcome]):
         if self._as_particles and options.residual:
             for number in numbers:
                 ensure_writable(residual_path(self._paths[number]), self._replace)
-            complete = [path for number, path in enumerate(self._paths) if number not in set(numbers) and path.exists()]
+            coming = set(numbers)
+            complete = [path for number, path in enumerate(self._paths) if number not in coming and path.exists()]
             if without := sum(not residual_path(path).exists() for path in complete):
                 console.say(f"{without} frames that are complete have no residual image; --overwrite makes both anew")
         if not numbers:
             return 0.0
         prepared, weights = self._prepared, self._common["weights"]
-        content = prepared.searchable(weights, settings) if self._as_particles else prepared.weights(weights)
-        if not self._as_particles and content.weights.on_demand:
+        if self._as_particles:
+            content = prepared.searchable(weights, settings)
+        else:
+            content = prepared.weights(weights)
             voxels = math.prod(content.weights.padded.shape)
-            console.say(
-                f"columns are made on demand: up to {written(voxels * COLUMN_S / 60.0, 2)} minutes of a core for each "
-                f"image, where all {written(voxels)} voxels can be lit"
-            )
-        shape = content.image_shape
-        if not self._as_particles:
+            if content.weights.on_demand:
+                console.say(
+                    f"columns are made on demand: up to {written(voxels * COLUMN_S / 60.0, 2)} minutes of a core for "
+                    f"each image, where all {written(voxels)} voxels can be lit"
+                )
             # The weights are in memory by now.
-            ensure_room(held_bytes(math.prod(content.weights.padded.shape), math.prod(shape)), self.label)
+            ensure_room(held_bytes(voxels, math.prod(content.image_shape)), self.label)
+        shape = content.image_shape
         dark = options.dark_image(shape)
         pitch_px = float(content.camera.micro_image_lattice_px().pitch.max())
         mask = mask_of(options.mask, frames, shape, pitch_px, options.keep_going)
