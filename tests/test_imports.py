@@ -29,7 +29,6 @@ LAYERS = (
     {"files"},
     {"console"},
     {"verbs"},
-    {"stages"},
     {"paper"},
     {"cli"},
     {"__init__", "__main__"},

@@ -26,7 +26,7 @@ from lfpiv_cli.optics.media import Media
 from lfpiv_cli.optics.shapes import HeightMap, ScenePose
 from lfpiv_cli.optics.surfaces import Cylinder, Plane, Sphere, TiltedPlane
 from lfpiv_cli.optics.tracing import ObjectSpace
-from lfpiv_cli.stages import validate, validate_board
+from lfpiv_cli.verbs import validate, validate_board
 from lfpiv_cli.verbs.build_weights import plan_of, ray_source, weights_of
 from lfpiv_cli.verbs.particles import searchable
 from lfpiv_cli.verbs.planning import bench_of

@@ -17,8 +17,8 @@ from lfpiv_cli.files.vtkhdf import write_vectors
 from lfpiv_cli.flow.field import VectorField
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.reference import Reference
-from lfpiv_cli.stages.validate import _truth_of_particles, light_notices
 from lfpiv_cli.synthetic.flows import shear
+from lfpiv_cli.verbs.validate import _truth_of_particles, light_notices
 
 CONFIGS = Path(__file__).parent.parent / "configs"
 

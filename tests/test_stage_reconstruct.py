@@ -13,8 +13,8 @@ from lfpiv_cli.cli.main import cli
 from lfpiv_cli.errors import InputError, OutputExistsError
 from lfpiv_cli.files.images import read_image
 from lfpiv_cli.files.vtkhdf import open_volume
+from lfpiv_cli.verbs.checks import word_of
 from lfpiv_cli.verbs.frames import Background
-from lfpiv_cli.verbs.verdicts import word_of
 
 ROOT = Path(__file__).parent.parent
 SAMPLE = ROOT / "sample_data"

@@ -8,8 +8,8 @@ import pytest
 
 from lfpiv_cli.console import Console
 from lfpiv_cli.errors import ConfigError, LimitMissedError
-from lfpiv_cli.stages import validate
-from lfpiv_cli.stages.validate import validate_flow
+from lfpiv_cli.verbs import validate
+from lfpiv_cli.verbs.validate import validate_flow
 
 SAMPLE = Path(__file__).parent.parent / "configs" / "sample.yaml"
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from lfpiv_cli.flow.field import MASKED, REJECTED
-from lfpiv_cli.verbs.verdicts import (
+from lfpiv_cli.verbs.checks import (
     FOR_INFORMATION,
     WORTHLESS,
     Reason,

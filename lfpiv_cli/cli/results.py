@@ -96,7 +96,7 @@ def validate(
     if config is None:
         raise click.UsageError(f"validate {what} needs a CONFIG")
     module = "validate_board" if what == "board" else "validate"
-    stage = getattr(import_module(f"lfpiv_cli.stages.{module}"), f"validate_{what}")
+    stage = getattr(import_module(f"lfpiv_cli.verbs.{module}"), f"validate_{what}")
     return cast(dict[str, Any], stage(config, output, overwrite=overwrite, console=console, **chosen))
 
 

@@ -19,13 +19,13 @@ from lfpiv_cli.paper.parts import Drawing, Findings, Row, Work
 from lfpiv_cli.paper.pictures import PAPERS_WALL, plane_figure, raw_figure, wall_profile_figure
 from lfpiv_cli.paper.table4 import SEED, TINY, ChannelSize, as_paper, at_best, channel_sections, simulated_duct
 from lfpiv_cli.reconstruction.images import still_light
-from lfpiv_cli.stages.validate import measured_of
 from lfpiv_cli.validation.flow import TOLERANCE, Duct, Measured, relative_errors
 from lfpiv_cli.verbs.build_weights import BuildWeightsOptions, build_weights_file
 from lfpiv_cli.verbs.calibrate import CalibrateOptions, calibrate_snapshot
 from lfpiv_cli.verbs.correlate import correlate_files
 from lfpiv_cli.verbs.reconstruct import ReconstructOptions, reconstruct_files
 from lfpiv_cli.verbs.simulate import frame_names, simulate_board, simulate_particles, simulate_white
+from lfpiv_cli.verbs.validate import measured_of
 
 
 def beside_wall(measured: Measured, duct: Duct) -> NDArray[np.bool_]:

@@ -21,7 +21,6 @@ from lfpiv_cli.files.pages import Table
 from lfpiv_cli.notice import written
 from lfpiv_cli.paper.parts import AS_PAPER, BOARD, Drawing, Findings, Row, Work, merged, sections
 from lfpiv_cli.paper.pictures import board_view, centres_figure, elongation_figure, location_figure, views_figure
-from lfpiv_cli.stages.validate_board import BoardBench, BoardSolver, bench_of, board_solver, placement_of
 from lfpiv_cli.synthetic.board import dot_centres
 from lfpiv_cli.validation.board import (
     DEPTH_DEFINITIONS,
@@ -33,6 +32,8 @@ from lfpiv_cli.validation.board import (
     board_figures,
     measure_dots,
 )
+from lfpiv_cli.verbs.simulate import placement_of
+from lfpiv_cli.verbs.validate_board import BoardBench, BoardSolver, bench_of, board_solver
 
 Half = Literal["ideal", "recorded"]
 Figures = dict[str, dict[str, Any]]

@@ -38,6 +38,9 @@ RECORD_BYTES = 100e3
 Stamp = tuple[int, int] | None
 
 
+ALL = Shard(1, 1)
+
+
 class Turn(Enum):
     """What keeps an output from being made: another worker makes it now, or has made it since the batch began."""
 
@@ -47,9 +50,6 @@ class Turn(Enum):
 
 # The numbers of outputs with what became of each, as it is known.
 Attempts = Generator[tuple[int, Made | Turn | InputError], None, None]
-
-
-ALL = Shard(1, 1)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -223,12 +223,7 @@ class Worked(Generic[Made]):
             write_text(path, listed + "\n", overwrite=True)
 
     def ensure_whole(self, summary: dict[str, Any], unit: str) -> dict[str, Any]:
-        """Return the summary of a batch of which nothing failed.
-
-        Raises
-        ------
-        PartialError : something did
-        """
+        """Return the summary of a batch of which nothing failed (PartialError: something did)."""
         if not self.failures:
             return summary
         told = f"{len(self.failures)} of {self.total()} {unit}s failed, the first because {self.failures[0].error}"
@@ -254,13 +249,19 @@ def work_through(batch: Batch[Made], options: BatchOptions, console: Console) ->
     console.warn(batch.notices)
     deadline = options.deadline()
     steps = batch.begin(left, console) if options.dask is None else 1.0
-    with (
-        console.frames(len(left), steps, batch.label, batch.unit) as work,
-        closing(_attempts(batch, before, options, deadline, work)) as attempts,
-    ):
+    with console.frames(len(left), steps, batch.label, batch.unit) as work:
+        if options.dask is None:
+            attempts = _made_here(batch, before, deadline, work)
+        else:
+            try:
+                from lfpiv_cli.verbs.distributed import made_by_workers
+            except ImportError as error:
+                raise UsageError(f'--dask needs distributed: pip install "lfpiv[cluster]" ({error})') from error
+            attempts = made_by_workers(batch, before, options.dask, deadline, work.console)
         # Closed at once where one fails: workers are let go.
-        for number, made in attempts:
-            _settle(batch, number, made, options.keep_going, work, worked)
+        with closing(attempts):
+            for number, made in attempts:
+                _settle(batch, number, made, options.keep_going, work, worked)
     worked.outcomes = dict(sorted(worked.outcomes.items()))
     done = worked.total()
     if options.shard.number == 1:
@@ -292,19 +293,6 @@ def attempt(batch: Batch[Made], number: int, before: Stamp, work: Frames) -> Mad
         if stamp_of(target.path) != before and state_of(target) is State.COMPLETE:
             return Turn.SKIPPED
         return batch.make(number, work)
-
-
-def _attempts(
-    batch: Batch[Made], before: Mapping[int, Stamp], options: BatchOptions, deadline: Deadline, work: Frames
-) -> Attempts[Made]:
-    """Yield outputs with what became of each, as long as there is time; `before` is what was in their places."""
-    if options.dask is None:
-        return _made_here(batch, before, deadline, work)
-    try:
-        from lfpiv_cli.verbs.distributed import made_by_workers
-    except ImportError as error:
-        raise UsageError(f'--dask needs distributed: pip install "lfpiv[cluster]" ({error})') from error
-    return made_by_workers(batch, before, options.dask, deadline, work.console)
 
 
 def _made_here(batch: Batch[Made], before: Mapping[int, Stamp], deadline: Deadline, work: Frames) -> Attempts[Made]:
@@ -339,16 +327,16 @@ def _settle(
     work: Frames,
     worked: Worked[Made],
 ) -> None:
-    """Note what became of an output.
-
-    Raises
-    ------
-    InputError : it could not be made, and the batch is not to go on without it
-    """
+    """Note what became of an output (InputError: it could not be made, and the batch is not to go on without it)."""
     name = batch.names[number]
     if isinstance(made, InputError):
         if not keep_going:
-            raise InputError(f"{made}{_done_before(batch, worked)}") from made
+            names = [batch.names[k] for k in worked.outcomes]
+            if not names:
+                raise InputError(str(made)) from made
+            told = names[0] if len(names) == 1 else f"{names[0]} to {names[-1]}"
+            written = f"{len(names)} of {len(batch.targets)} {batch.unit}s were written before"
+            raise InputError(f"{made}; {written}: {told}") from made
         worked.failures.append(Failure(name, str(made)))
         work.console.warn([Notice("frame-failed", name, str(made), "leave it out, or mend it")])
     elif isinstance(made, Turn):
@@ -367,22 +355,8 @@ def stamp_of(path: Path) -> Stamp:
     return status.st_ino, status.st_mtime_ns
 
 
-def _done_before(batch: Batch[Made], worked: Worked[Made]) -> str:
-    """Return what has been made of a batch that ends early, in words."""
-    if not worked.outcomes:
-        return ""
-    names = [batch.names[number] for number in worked.outcomes]
-    told = names[0] if len(names) == 1 else f"{names[0]} to {names[-1]}"
-    return f"; {len(names)} of {len(batch.targets)} {batch.unit}s were written before: {told}"
-
-
 def dry_run(batch: Batch[Any], options: WorkOptions, console: Console) -> dict[str, Any]:
-    """Return what a batch would make, and what that takes; write nothing.
-
-    Raises
-    ------
-    LfpivError : the batch would not begin
-    """
+    """Return what a batch would make, and what that takes; write nothing (LfpivError: the batch would not begin)."""
     share = _share(batch, options, console)
     targets = [batch.targets[number] for number in share]
     needed = [share[k] for k in pending(targets, (), batch.overwrite, options.resume, dry=True)]
@@ -400,25 +374,20 @@ def dry_run(batch: Batch[Any], options: WorkOptions, console: Console) -> dict[s
         "unreadable": len(faults) + len(batch.left_out),
     }
     expected = batch.expected() if making else Expected()
-    told |= _disk(batch, len(making), skipped, expected)
+    folder = next(path for path in batch.targets[0].path.absolute().parents if path.exists())
+    known = [sum(path.stat().st_size for path in batch.targets[number].paths) for number in skipped]
+    each, known_by = median(known) if known else None, "those that are there"
+    if each is None and expected.file_bytes is not None:
+        each, known_by = expected.file_bytes + RECORD_BYTES, AT_MOST
+    told |= {
+        "disk_mb": None if each is None else len(making) * each / MB,
+        "disk_by": None if each is None else known_by,
+        "disk_free_mb": shutil.disk_usage(folder).free / MB,
+    }
     told |= time_and_memory(batch.label, len(making), expected, console)
     if console.only_warnings:
         told["would_make"] = [str(batch.targets[number].path) for number in making]
     return told
-
-
-def _disk(batch: Batch[Any], count: int, complete: Sequence[int], expected: Expected) -> dict[str, float | str | None]:
-    """Return how much disk so many outputs take, by what that is known, and how much is free."""
-    folder = next(path for path in batch.targets[0].path.absolute().parents if path.exists())
-    known = [sum(path.stat().st_size for path in batch.targets[number].paths) for number in complete]
-    each, known_by = median(known) if known else None, "those that are there"
-    if each is None and expected.file_bytes is not None:
-        each, known_by = expected.file_bytes + RECORD_BYTES, AT_MOST
-    return {
-        "disk_mb": None if each is None else count * each / MB,
-        "disk_by": None if each is None else known_by,
-        "disk_free_mb": shutil.disk_usage(folder).free / MB,
-    }
 
 
 def time_and_memory(label: str, count: int, expected: Expected, console: Console) -> dict[str, float | str | None]:

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lfpiv_cli.calibration.model import Calibration
 from lfpiv_cli.console import CONSOLE, Console
@@ -20,7 +19,6 @@ from lfpiv_cli.files.calibration_file import read_calibration
 from lfpiv_cli.files.config import Config, load_config
 from lfpiv_cli.files.inputs import given
 from lfpiv_cli.files.provenance import record, with_warnings
-from lfpiv_cli.files.sections_simulated import WeightsSection
 from lfpiv_cli.files.weights_file import WeightsFile, open_weights, write_weights
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.names import Method, Refraction, Sampling
@@ -29,15 +27,7 @@ from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.curved_space import CurvedSpace
 from lfpiv_cli.optics.tracing import ObjectSpace, PolynomialRays
 from lfpiv_cli.reference import Reference
-from lfpiv_cli.verbs.weights_cost import (
-    check_rays,
-    check_rig,
-    cost_notices,
-    cost_of,
-    ensure_fits,
-    ensure_volume_fits,
-    rig_notices,
-)
+from lfpiv_cli.verbs import weights_cost
 from lfpiv_cli.weights.build import default_padding, scene_distortion
 from lfpiv_cli.weights.columns import ColumnOperator, OnDemandOperator, operator_of, seen_share
 from lfpiv_cli.weights.model import Weights, WeightsOperator
@@ -124,41 +114,58 @@ def plan_of(settings: Config, found: Calibration | None) -> Plan:
     ConfigError, InputError
         Rig and settings are not possible, or need another calibration.
     """
-    check_rig(settings, found)
+    weights_cost.check_rig(settings, found)
     camera = settings.camera_model()
     if found:
         camera = found.camera(camera)
-    reference = _reference(settings, found)
+    # Fitted rays count z from the origin that the boards' depths were told from.
+    reference = Reference(settings.volume.reference, 0.0)
+    if reference.name != "focal_point" and settings.weights.method != "dlfc":
+        if found is None or found.mid_plane_z_mm is None:
+            raise ConfigError(
+                "volume.reference: mid_plane needs a calibration with a board or with --depth-mm, and the section "
+                "channel: they say where the mid plane lies"
+            )
+        reference = Reference(reference.name, found.mid_plane_z_mm)
     grid = settings.grid(reference)
-    source = ray_source(settings, found)
-    padding = settings.reconstruction.padding_voxel or _padding(settings, camera, source, grid)
-    check_rays(settings, source, grid.padded(padding))
+    source, padding = ray_source(settings, found), settings.reconstruction.padding_voxel
+    if not padding and isinstance(source, CurvedSpace):
+        padding = curved_padding(camera, source, grid)
+    padding = padding or default_padding(camera, settings.media_model(), grid)
+    weights_cost.check_rays(settings, source, grid.padded(padding))
+    # What may lie out of view without a word.
+    x, y, z = (-math.ceil(RIM_SHARE * n) if n > 2 else 0 for n in grid.shape_xyz)
     notices = [
-        *rig_notices(settings, found, camera, source, grid),
-        *_view_notices(*seen_share(camera, source, _without_rim(grid)), grid),
+        *weights_cost.rig_notices(settings, found, camera, source, grid),
+        *_view_notices(*seen_share(camera, source, grid.padded((x, y, z))), grid),
         *_reach_notices(settings, found, grid),
     ]
     return Plan(settings, found, camera, reference, grid, padding, source, notices)
 
 
 def weights_of(plan: Plan, provenance: dict[str, Any], console: Console) -> WeightsFile:
-    """Return the weights of a plan."""
+    """Return the weights of a plan: factorised where the axes separate, else on demand; or counted where asked for."""
     settings, camera, grid, found = plan.settings, plan.camera, plan.grid, plan.found
     if settings.volume.size_mm is not None:
         console.say(VOXELS_CHOSEN.format(*map(written, grid.spacing_mm)))
-    operator = make_operator(settings.weights, camera, plan.source, grid.padded(plan.padding), console)
+    padded, chosen = grid.padded(plan.padding), settings.weights
+    operator: WeightsOperator
+    if chosen.sampling == "exact" or isinstance(plan.source, PolynomialRays):
+        operator = operator_of(camera, plan.source, padded)
+        if isinstance(operator, OnDemandOperator):
+            console.say(ON_DEMAND)
+    else:
+        layout = OnDemandOperator(camera, plan.source, padded)
+        voxels, count = math.prod(layout.shape), RayCount(chosen.points, chosen.rays_per_point)
+        centres, rng = layout.centres_mm(np.arange(voxels)), np.random.default_rng(chosen.seed)
+        with console.progress(voxels, "count rays") as advance:
+            columns = count_columns(camera, plan.source, centres, layout.sides_mm, rng, count, advance)
+        operator = ColumnOperator(layout.shape, layout.image_shape, np.arange(voxels), columns)
     traced = isinstance(plan.source, ObjectSpace) and isinstance(operator, FactorisedOperator)
     bend = scene_distortion(camera, settings.media_model(), grid) if traced else None
     weights = Weights(grid, plan.padding, operator, camera.column_axis, found, bend)
     vignetting = found.vignetting() if found else None
     return WeightsFile(weights, camera, plan.reference, provenance, vignetting)
-
-
-def _padding(settings: Config, camera: Camera, source: Source, grid: Grid) -> tuple[int, int, int]:
-    """Return how many voxels to solve for beyond each side of a grid."""
-    if isinstance(source, CurvedSpace):
-        return curved_padding(camera, source, grid)
-    return default_padding(camera, settings.media_model(), grid)
 
 
 def curved_summary(content: WeightsFile) -> dict[str, Any]:
@@ -169,17 +176,16 @@ def curved_summary(content: WeightsFile) -> dict[str, Any]:
     """
     operator, outside = content.weights.solver_operator, {"voxels_outside_fluid": content.weights.voxels_outside_fluid}
     if isinstance(operator, StripOperator):
-        return {**_misfit_figures(operator.misfit_l1), **outside}
+        misfit = operator.misfit_l1
+        middle_and_worst = (
+            {"column_misfit_l1_median": float(np.median(misfit)), "column_misfit_l1_largest": float(misfit.max())}
+            if misfit.size
+            else {}
+        )
+        return middle_and_worst | outside
     if isinstance(operator, OnDemandOperator) and isinstance(operator.source, CurvedSpace):
         return {"ray_misfit_mm": aimed_misfit_mm(content.camera, operator.source, content.weights.grid), **outside}
     return {}
-
-
-def _misfit_figures(misfit_l1: NDArray[np.float64]) -> dict[str, float]:
-    """Return the middle and the worst of the columns' misfits; none where there are no columns."""
-    if not misfit_l1.size:
-        return {}
-    return {"column_misfit_l1_median": float(np.median(misfit_l1)), "column_misfit_l1_largest": float(misfit_l1.max())}
 
 
 def misfit_notices(content: WeightsFile) -> list[Notice]:
@@ -242,45 +248,6 @@ def _reach_notices(settings: Config, found: Calibration | None, grid: Grid) -> l
     return notices
 
 
-def make_operator(
-    chosen: WeightsSection, camera: Camera, source: Source, grid: Grid, console: Console
-) -> WeightsOperator:
-    """Return the weights of a grid: factorised where the axes separate, else on demand; or counted where asked for."""
-    if chosen.sampling == "exact" or isinstance(source, PolynomialRays):
-        operator = operator_of(camera, source, grid)
-        if isinstance(operator, OnDemandOperator):
-            console.say(ON_DEMAND)
-        return operator
-    layout = OnDemandOperator(camera, source, grid)
-    voxels, count = math.prod(layout.shape), RayCount(chosen.points, chosen.rays_per_point)
-    centres, rng = layout.centres_mm(np.arange(voxels)), np.random.default_rng(chosen.seed)
-    with console.progress(voxels, "count rays") as advance:
-        columns = count_columns(camera, source, centres, layout.sides_mm, rng, count, advance)
-    return ColumnOperator(layout.shape, layout.image_shape, np.arange(voxels), columns)
-
-
-def _reference(settings: Config, found: Calibration | None) -> Reference:
-    """Return the origin of the volume's coordinates.
-
-    Fitted rays count z from the origin that the boards' depths were told from.
-    """
-    name = settings.volume.reference
-    if name == "focal_point" or settings.weights.method == "dlfc":
-        return Reference(name, 0.0)
-    if found is None or found.mid_plane_z_mm is None:
-        raise ConfigError(
-            "volume.reference: mid_plane needs a calibration with a board or with --depth-mm, and the section channel: "
-            "they say where the mid plane lies"
-        )
-    return Reference(name, found.mid_plane_z_mm)
-
-
-def _without_rim(grid: Grid) -> Grid:
-    """Return a grid without what may lie out of view without a word."""
-    x, y, z = (-math.ceil(RIM_SHARE * n) if n > 2 else 0 for n in grid.shape_xyz)
-    return grid.padded((x, y, z))
-
-
 def _view_notices(smallest: float, largest: float, grid: Grid) -> list[Notice]:
     """Return whether the sensor sees a volume only in part, by the shares of its voxels' light that it sees.
 
@@ -298,16 +265,8 @@ def _view_notices(smallest: float, largest: float, grid: Grid) -> list[Notice]:
         return []
     text = "a part of it lies outside the camera's view, where nothing will be found"
     remedy = "a smaller volume, or another centre_mm"
-    return [
-        Notice(
-            "volume-out-of-view",
-            "volume",
-            text,
-            remedy,
-            float(smallest),
-            f"at least {LEAST_SEEN:g} of each voxel's light on the sensor",
-        )
-    ]
+    expected = f"at least {LEAST_SEEN:g} of each voxel's light on the sensor"
+    return [Notice("volume-out-of-view", "volume", text, remedy, float(smallest), expected)]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -350,7 +309,7 @@ def build_weights_file(
     found = read_calibration(options.calibration) if options.calibration else None
     settings = load_config(config).overridden_by("weights", options).with_scene_of(found)
     if not options.dry_run:
-        ensure_volume_fits(settings, by_volumes=False)
+        weights_cost.ensure_volume_fits(settings, by_volumes=False)
     plan = plan_of(settings, found)
     summary = {
         "voxels_xyz": list(plan.grid.shape_xyz),
@@ -363,11 +322,11 @@ def build_weights_file(
     made = record("build-weights", settings.resolved(), inputs)
     if options.resume and is_kept([output], made, inputs.values(), overwrite):
         return summary | {"frame": open_weights(output).frame, "file_bytes": output.stat().st_size}
-    cost = cost_of(settings, plan.camera, plan.source, plan.grid.padded(plan.padding))
-    console.warn([*plan.notices, *cost_notices(cost)])
+    cost = weights_cost.cost_of(settings, plan.camera, plan.source, plan.grid.padded(plan.padding))
+    console.warn([*plan.notices, *weights_cost.cost_notices(cost)])
     if options.dry_run:
         return summary | cost.summary()
-    ensure_fits(cost, output)
+    weights_cost.ensure_fits(cost, output)
     console.detail(f"about {written(cost.weights_core_s, 2)} s of a core and {written(cost.weights_bytes / 1e9, 2)} GB")
     content = weights_of(plan, made, console)
     found_out = misfit_notices(content)

@@ -11,23 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from lfpiv_cli.calibration import model
+from lfpiv_cli.calibration import light_checks, model, sheet
 from lfpiv_cli.calibration.lens_light import LensImages
-from lfpiv_cli.calibration.light_checks import (
-    dark_notices,
-    position_notices,
-    shape_notices,
-    shapes_of,
-    white_notices,
-)
 from lfpiv_cli.calibration.model import Calibration, DataSheet, Photographs
-from lfpiv_cli.calibration.sheet import (
-    board_notices,
-    check_f_numbers,
-    entrance_pupil_notices,
-    f_number_notices,
-    image_distance_notices,
-)
 from lfpiv_cli.calibration.white import by_aperture, lens_image_width
 from lfpiv_cli.console import CONSOLE, Console
 from lfpiv_cli.errors import ConfigError, UsageError
@@ -125,26 +111,31 @@ def photographs(
 def calibration_of(rig: Config, pictures: Photographs) -> Calibration:
     """Return the calibration that pictures of the rig give."""
     if pictures.mid_plane_z_mm is not None:
-        _check_mid_plane(pictures.mid_plane_z_mm, rig)
+        if not np.isfinite(pictures.mid_plane_z_mm):
+            raise UsageError(f"a depth of {pictures.mid_plane_z_mm:g} mm, expected a number")
+        if rig.channel is None:
+            raise ConfigError(
+                "a depth without a board is the mid plane's of a channel; the section `channel` is missing"
+            )
     camera = rig.camera.model() if pictures.whites else rig.camera_model()
     if camera is not None:
-        check_f_numbers(camera)
-    sheet = DataSheet(rig.camera.microlenses.layout, rig.micro_image_pitch_px(), camera)
+        sheet.check_f_numbers(camera)
+    told = DataSheet(rig.camera.microlenses.layout, rig.micro_image_pitch_px(), camera)
     has_board = pictures.board is not None or len(pictures.depth_boards) > 0
     if has_board and rig.board.medium == "fluid":
         rig.ensure_plane_layers("calibrating by a board in the fluid")
-    return model.calibrate(pictures, rig.rig() if has_board else None, sheet)
+    return model.calibrate(pictures, rig.rig() if has_board else None, told)
 
 
 def calibration_notices(rig: Config, pictures: Photographs, found: Calibration) -> list[Notice]:
     """Return what speaks against a calibration and the pictures that it is from."""
     camera = rig.camera.model()
-    notices = [] if camera is None else f_number_notices(camera)
+    notices = [] if camera is None else sheet.f_number_notices(camera)
     if found.pose is not None and camera is not None:
-        notices += board_notices(found.pose, rig.rig().board, camera, rig.media_model())
+        notices += sheet.board_notices(found.pose, rig.rig().board, camera, rig.media_model())
     if found.ray_fit is not None and camera is not None:
         rays = found.ray_fit
-        notices += entrance_pupil_notices(rays.entrance_pupil_mm, rays.entrance_pupil_sigma_mm, camera)
+        notices += sheet.entrance_pupil_notices(rays.entrance_pupil_mm, rays.entrance_pupil_sigma_mm, camera)
     if camera is not None and found.pose is None and found.ray_fit is None:
         notices.append(NO_BOARD)
     notices += light_notices(rig, pictures, found)
@@ -153,8 +144,8 @@ def calibration_notices(rig: Config, pictures: Photographs, found: Calibration) 
     order = by_aperture(pictures.whites, pictures.dark)
     first, widest = (pictures.less_dark(pictures.whites[order[place]]) for place in (0, -1))
     width = lens_image_width(found.rectification.apply(widest), found.rectification.lattice_px)
-    notices += white_notices(first, found.fit, width, None if camera is None else camera.lens_image_width)
-    return notices if camera is None else notices + image_distance_notices(found.fit, camera)
+    notices += light_checks.white_notices(first, found.fit, width, None if camera is None else camera.lens_image_width)
+    return notices if camera is None else notices + sheet.image_distance_notices(found.fit, camera)
 
 
 def light_notices(rig: Config, pictures: Photographs, found: Calibration) -> list[Notice]:
@@ -165,30 +156,19 @@ def light_notices(rig: Config, pictures: Photographs, found: Calibration) -> lis
         return []
     width = 1.0 if camera is None else camera.lens_image_width
     images = LensImages.of(found.rectification, found.transmission, width)
-    notices = [] if pictures.dark is None else dark_notices(images, np.asarray(pictures.dark, dtype=np.float64))
+    notices = (
+        [] if pictures.dark is None else light_checks.dark_notices(images, np.asarray(pictures.dark, dtype=np.float64))
+    )
     if found.transmission is not None:
-        notices += shape_notices(shapes_of(images, found.rectification.image_shape))
+        notices += light_checks.shape_notices(light_checks.shapes_of(images, found.rectification.image_shape))
     for number, board in enumerate(boards, 1):
         name = "board image" if len(boards) == 1 else f"board image {number}"
-        notices += position_notices(images, pictures.less_dark(board), name, MOVED_SINCE_WHITE)
+        notices += light_checks.position_notices(images, pictures.less_dark(board), name, MOVED_SINCE_WHITE)
     return notices
 
 
-def _check_mid_plane(z_mm: float, rig: Config) -> None:
-    """Refuse a mid plane that is told where there is no channel, or no depth."""
-    if not np.isfinite(z_mm):
-        raise UsageError(f"a depth of {z_mm:g} mm, expected a number")
-    if rig.channel is None:
-        raise ConfigError("a depth without a board is the mid plane's of a channel; the section `channel` is missing")
-
-
 def ensure_pictures(whites: int, boards: int, depths: int) -> None:
-    """Refuse numbers of pictures and depths that make no calibration.
-
-    Raises
-    ------
-    UsageError
-    """
+    """Refuse numbers of pictures and depths that make no calibration (UsageError)."""
     if not whites and not boards:
         raise UsageError("calibrate-snapshot needs a picture: --white, --board or both")
     if depths not in (0, max(boards, 1)) or (boards > 1 and not depths):
@@ -233,12 +213,7 @@ class CalibrateOptions:
 
 
 def calibrate_snapshot(
-    config: Path,
-    output: Path,
-    options: CalibrateOptions,
-    *,
-    overwrite: bool = False,
-    console: Console = CONSOLE,
+    config: Path, output: Path, options: CalibrateOptions, *, overwrite: bool = False, console: Console = CONSOLE
 ) -> dict[str, Any]:
     """Find the lattice in white images and the focal plane in a snapshot of the board, or rays in boards at depths."""
     white, board, depth_mm = options.white, options.board, options.depth_mm

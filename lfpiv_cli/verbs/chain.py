@@ -86,17 +86,6 @@ DLFC_BOARDS = 5
 DLFC_MARGIN = 0.05
 
 
-def run_chain(config: Path, output: Path, *, overwrite: bool = False, console: Console = CONSOLE) -> dict[str, Path]:
-    """Simulate the config's experiment in a folder and measure its flow; return the vectors by their method.
-
-    From raw images with all imperfections on, which every method gets alike, through the same stages and files as
-    recorded ones; of a longer sequence, the first two.
-    """
-    images = output / "images"
-    simulate_images(config, images, overwrite=overwrite, console=console)
-    return measure_images(config, images, output, overwrite=overwrite, console=console)
-
-
 def simulate_images(config: Path, images: Path, *, overwrite: bool = False, console: Console = CONSOLE) -> None:
     """Simulate all images of the config's experiment, boards at several depths where its weights need them."""
     settings = load_config(config)

@@ -10,16 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lfpiv_cli.calibration import light_checks
 from lfpiv_cli.calibration.lens_light import LensImages, dark_level
-from lfpiv_cli.calibration.light_checks import (
-    CERTAIN_SIGMAS,
-    LIT_SIGMAS,
-    exposure_notices,
-    level_notices,
-    position_notices,
-    saturated_share,
-    uniform_notices,
-)
 from lfpiv_cli.calibration.model import Calibration
 from lfpiv_cli.console import CONSOLE, Console
 from lfpiv_cli.errors import ConfigError, InputError
@@ -37,6 +29,7 @@ from lfpiv_cli.reconstruction.images import FULL_SCALES, Mask, defects, light, s
 from lfpiv_cli.validation import planning
 from lfpiv_cli.validation.planning import share_beyond
 from lfpiv_cli.verbs.calibrate import NO_BOARD, calibration_notices, calibration_of, photographs
+from lfpiv_cli.verbs.checks import word_of
 from lfpiv_cli.verbs.planning import (
     Bench,
     Line,
@@ -51,7 +44,6 @@ from lfpiv_cli.verbs.planning import (
     seeding_line,
     worst,
 )
-from lfpiv_cli.verbs.verdicts import word_of
 from lfpiv_cli.weights.build import aligned, default_padding
 
 # What images tell of an experiment before anything is made of them: a verdict a line.
@@ -99,7 +91,7 @@ class Seen:
     def above(self) -> Image:
         """Light above the background, 0 where it is within noise."""
         rest = self.less_dark - np.float32(self.level)
-        return np.where(rest > LIT_SIGMAS * self.noise, rest, np.float32(0.0))
+        return np.where(rest > light_checks.LIT_SIGMAS * self.noise, rest, np.float32(0.0))
 
 
 def lattice_of(settings: Config, pictures: Pictures) -> tuple[Calibration | None, list[Line]]:
@@ -137,8 +129,19 @@ def image_lines(bench: Bench, pictures: Pictures, lattice: Calibration | None) -
         number, tracer_light = _counted(bench, seen)
         asked.append([question(bench, seen) for question in QUESTIONS] + [_tracers(bench, seen, number)])
         asked[-1].append(_precision(bench, seen, tracer_light))
-        figures.append(_figures(seen, number, tracer_light))
-    lines = [_worst_of(answers) for answers in zip(*asked, strict=True)]
+        known = bool(np.isfinite(number))
+        figures.append(
+            {
+                "image": name,
+                "background_counts": seen.level,
+                "noise_counts": seen.noise,
+                "signal_to_noise": _signal(seen),
+                "tracers_per_lens": number if known else None,
+                "tracer_counts": tracer_light if known else None,
+            }
+        )
+    # The first of the worst answers to each question.
+    lines = [next(line for line in every if line.verdict == worst(every)) for every in zip(*asked, strict=True)]
     return lines, {name: [each[name] for each in figures] for name in figures[0]} if figures else {}
 
 
@@ -158,27 +161,19 @@ def _seen(bench: Bench, name: str, raw: Image, dark: Image | None, lattice: Cali
     if lattice is not None:
         width = bench.camera.lens_image_width
         lens_images = LensImages.of(lattice.rectification, lattice.transmission, width)
-    return Seen(
-        name, raw, too_bright, less_dark, *_background_of(less_dark, dark is not None, lens_images), lens_images
-    )
-
-
-def _background_of(less_dark: Image, has_dark: bool, lens_images: LensImages | None) -> tuple[float, float]:
-    """Return level and noise of a background, between the lens images where it is known where they lie."""
+    # Of the background, between the lens images where it is known where they lie.
     if lens_images is not None:
-        return lens_images.background(less_dark)
-    return (0.0, read_noise(less_dark.astype(np.float64))) if has_dark else dark_level(less_dark.ravel())
-
-
-def _worst_of(answers: Sequence[Line]) -> Line:
-    """Return the first of the worst answers to one question."""
-    verdict = worst(answers)
-    return next(line for line in answers if line.verdict == verdict)
+        level, noise = lens_images.background(less_dark)
+    elif dark is not None:
+        level, noise = 0.0, read_noise(less_dark.astype(np.float64))
+    else:
+        level, noise = dark_level(less_dark.ravel())
+    return Seen(name, raw, too_bright, less_dark, level, noise, lens_images)
 
 
 def _counted(bench: Bench, seen: Seen) -> tuple[float, float]:
     """Return tracers for each lens that looks at the volume, and the light of one."""
-    level = max(LIT_SIGMAS * seen.noise, 0.5)
+    level = max(light_checks.LIT_SIGMAS * seen.noise, 0.5)
     part = planning.part_in_front(bench.camera, bench.media, bench.bounds_mm)
     rest = seen.less_dark[part] - np.float32(seen.level)
     lit = float(np.mean(rest > level)), level, float(np.mean(rest, dtype=np.float64))
@@ -186,23 +181,19 @@ def _counted(bench: Bench, seen: Seen) -> tuple[float, float]:
     number, tracer_light = planning.tracers_per_lens(bench.camera, bench.seen[0], lit)
     if np.isfinite(number):
         return number, tracer_light
-    crowded = _crowded(bench, seen)
+    # Where hardly a pixel is dark; None where nobody can tell.
+    camera, padding = bench.camera, default_padding(bench.camera, bench.media, bench.grid)
+    view = raw_view(camera, bench.media, bench.tracer().radius_mm, bench.found)
+    lattice_px = camera.micro_image_lattice_px() if bench.found is None else bench.found.fit.lattice_px
+    seeded = Seeded(view, camera, bench.grid.padded(padding), bench.grid, bench.grid.bounds_mm(2))
+    crowded = tracers_in_image(seeded, seen.less_dark.astype(np.float64), np.isfinite(seen.less_dark), lattice_px)
     if crowded is None:
         return number, tracer_light
     return crowded, lit[2] * float(bench.camera.micro_image_lattice_px().cell_area) / crowded
 
 
-def _crowded(bench: Bench, seen: Seen) -> float | None:
-    """Return tracers for each lens where hardly a pixel is dark; None where nobody can tell."""
-    camera, padding = bench.camera, default_padding(bench.camera, bench.media, bench.grid)
-    view = raw_view(camera, bench.media, bench.tracer().radius_mm, bench.found)
-    lattice_px = camera.micro_image_lattice_px() if bench.found is None else bench.found.fit.lattice_px
-    seeded = Seeded(view, camera, bench.grid.padded(padding), bench.grid, bench.grid.bounds_mm(2))
-    return tracers_in_image(seeded, seen.less_dark.astype(np.float64), np.isfinite(seen.less_dark), lattice_px)
-
-
 def _exposure(bench: Bench, seen: Seen) -> Line:
-    share = saturated_share(seen.less_dark, seen.saturated, (seen.level, seen.noise))
+    share = light_checks.saturated_share(seen.less_dark, seen.saturated, (seen.level, seen.noise))
     is_known = np.isfinite(seen.raw)
     if not is_known.any():
         return Line("exposure", "no", f"{seen.name}: none of its pixels is a number")
@@ -211,7 +202,7 @@ def _exposure(bench: Bench, seen: Seen) -> Line:
         f"{seen.name}: the brightest pixel is at {float(seen.raw[is_known].max()) / scale:.0%} of {scale:g} counts, "
         f"{share:.2%} of the lit ones are saturated"
     )
-    notices = exposure_notices(share, seen.name)
+    notices = light_checks.exposure_notices(share, seen.name)
     if not notices:
         return Line("exposure", "good", reason)
     return Line("exposure", word_of(notices[0].record()), f"{reason}: {notices[0].remedy}")
@@ -245,10 +236,10 @@ def _lens_images(_bench: Bench, seen: Seen) -> Line:
     if not found.lit or not np.isfinite(sigma):
         return Line(about, "unknown", f"{seen.name}: too little light tells whether they have moved")
     remedy = "take white image and frames with the camera as it is"
-    notices = position_notices(seen.lens_images, seen.less_dark, seen.name, remedy)
+    notices = light_checks.position_notices(seen.lens_images, seen.less_dark, seen.name, remedy)
     if not notices:
         return Line(about, "good", f"{seen.name}: moved by {size:.2f} +- {sigma:.2f} px since the white image")
-    off = notices[0].code == "light-off-lens-images" or size - CERTAIN_SIGMAS * sigma > MOST_MOVED * pitch
+    off = notices[0].code == "light-off-lens-images" or size - light_checks.CERTAIN_SIGMAS * sigma > MOST_MOVED * pitch
     return Line(about, "no" if off else "look", f"{notices[0].about}: {notices[0].text}; {notices[0].remedy}")
 
 
@@ -259,7 +250,7 @@ def _background(_bench: Bench, seen: Seen) -> Line:
             f"{seen.name}: {written(seen.level)} counts, with noise of {written(seen.noise, 2)}; --white tells more"
         )
         return Line("background", "unknown", reason)
-    notices = level_notices(seen.lens_images, seen.less_dark, seen.name)
+    notices = light_checks.level_notices(seen.lens_images, seen.less_dark, seen.name)
     if notices:
         return Line("background", "look", f"{seen.name}: {notices[0].text}; {notices[0].remedy}")
     return Line("background", "good", f"{seen.name}: {written(seen.level, 2)} counts beside the dark image")
@@ -269,7 +260,8 @@ def _beyond(bench: Bench, seen: Seen) -> Line:
     about = "light outside"
     if bench.found is None and not aligned(bench.camera):
         return Line(about, "unknown", "the array is not aligned with the sensor: --calibration, or --white")
-    if bench.settings.volume.reference == "mid_plane" and not bench.knows_mid_plane:
+    knows_mid_plane = bench.found is not None and bench.found.mid_plane_z_mm is not None
+    if bench.settings.volume.reference == "mid_plane" and not knows_mid_plane:
         return Line(about, "unknown", "where the volume lies a calibration with a board tells: --calibration")
     picture = seen.above
     if bench.found is not None:
@@ -283,7 +275,7 @@ def _beyond(bench: Bench, seen: Seen) -> Line:
 
 def _tracers(bench: Bench, seen: Seen, number: float) -> Line:
     if seen.lens_images is not None and bench.found is not None:
-        for notice in uniform_notices(seen.lens_images, bench.found.fit, seen.less_dark, seen.name):
+        for notice in light_checks.uniform_notices(seen.lens_images, bench.found.fit, seen.less_dark, seen.name):
             return Line("tracers", "no", f"{notice.about}: {notice.text}; {notice.remedy}")
     if not np.isfinite(number):
         reason = "hardly a pixel is dark: two tracers per microlens or more, or haze; volumes err less than particles"
@@ -296,32 +288,16 @@ def _precision(bench: Bench, seen: Seen, tracer_light: float) -> Line:
     about = "precision, measured"
     if not 0.0 < tracer_light < np.inf:
         return Line(about, "unknown", f"{seen.name}: no tracer could be told from others")
-    errors = _errors(bench, seen, tracer_light)
+    # The median smallest errors (3,) of tracers of this light, with the noise of the image.
+    plain = bench.tracer()
+    tracer = replace(plain, light_counts=tracer_light, readout=replace(plain.readout, read_noise_counts=seen.noise))
+    errors = np.median(bench.errors_of(tracer), axis=0)
     reason = (
         f"{seen.name}: a tracer alone of {written(tracer_light, 2)} counts, as here, is placed to "
         f"{written(1e3 * errors[0], 2)} um across and {written(1e3 * errors[2], 2)} um in depth at best, "
         f"{by_which_light(bench)}"
     )
     return Line(about, error_verdict(bench, errors[2]), reason)
-
-
-def _errors(bench: Bench, seen: Seen, tracer_light: float) -> NDArray[np.float64]:
-    """Return the median smallest errors (3,) of tracers of a light, with the noise of an image."""
-    plain = bench.tracer()
-    tracer = replace(plain, light_counts=tracer_light, readout=replace(plain.readout, read_noise_counts=seen.noise))
-    return np.asarray(np.median(bench.errors_of(tracer), axis=0))
-
-
-def _figures(seen: Seen, number: float, tracer_light: float) -> dict[str, Any]:
-    known = np.isfinite(number)
-    return {
-        "image": seen.name,
-        "background_counts": seen.level,
-        "noise_counts": seen.noise,
-        "signal_to_noise": _signal(seen),
-        "tracers_per_lens": number if known else None,
-        "tracer_counts": tracer_light if known else None,
-    }
 
 
 QUESTIONS: Sequence[Callable[[Bench, Seen], Line]] = (_exposure, _light, _background, _lens_images, _beyond)
@@ -379,11 +355,7 @@ def check(
         of_images, measured = image_lines(bench, pictures, found)
         lines, figures = [*lines, *of_images], figures | measured
     if options.picture is not None:
-        _draw(options.picture, bench, overwrite)
+        from lfpiv_cli.pictures.calibration import planning_figure
+
+        write_picture(options.picture, planning_figure(by_depth(bench), bench.bounds_mm), overwrite)
     return {"verdicts": [line.row() for line in lines], **figures, "verdict": worst(lines)}
-
-
-def _draw(path: Path, bench: Bench, overwrite: bool) -> None:
-    from lfpiv_cli.pictures.calibration import planning_figure
-
-    write_picture(path, planning_figure(by_depth(bench), bench.bounds_mm), overwrite)

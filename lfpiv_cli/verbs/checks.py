@@ -1,19 +1,28 @@
-"""What speaks against vectors and tracks: windows that do not fit the volumes or hold too few tracers, wrong links."""
+"""What speaks against vectors and tracks, and whether a result can be relied on: good, look, or no, with reasons.
+
+Windows may not fit the volumes or hold too few tracers, links be wrong. For the verdict three parts of the chain are
+judged: the calibration, the images and what was found in them, and the vectors. What was warned of when files were made
+counts, and for vectors what the flow says against them (`flow.field`).
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter
 
+from lfpiv_cli.arrays import Floats
+from lfpiv_cli.calibration.light_checks import MOST_SATURATED
+from lfpiv_cli.files.atomic import without_nan
 from lfpiv_cli.files.particle_file import PointRows
 from lfpiv_cli.files.provenance import calibrated_with
-from lfpiv_cli.files.vtkhdf import Volume
-from lfpiv_cli.flow.field import MASKED, REJECTED, VALID, VectorField
+from lfpiv_cli.files.vtkhdf import Volume, open_vectors
+from lfpiv_cli.flow.field import MASKED, REJECTED, VALID, VectorField, difference_over_stated, divergence_over_stated
 from lfpiv_cli.flow.sums import margins, valid_shares
 from lfpiv_cli.flow.windows import CorrelationSettings, WindowLayout
 from lfpiv_cli.notice import Notice, written
@@ -46,6 +55,8 @@ MOST_WITHOUT, MOST_IN_DOUBT = 0.5, 0.5
 LARGEST_MEDIAN_SIGMA = 0.5
 # Only a volume and itself correlate so well and lie so still: two images of the same tracers have different noise.
 SAME_CORRELATION, STILL_VOXEL = 0.9999, 1e-3
+# A range of displacements leaves out so many percent at either end, where a few are false.
+LEFT_OUT_PERCENT = 5.0
 WINDOWS = "correlation.windows"
 
 
@@ -66,7 +77,7 @@ class Quality:
     in_doubt: int
     finite: int
     without: int
-    sigma: NDArray[np.float64]
+    sigma: Floats
 
     def summary(self) -> dict[str, Any]:
         """Return the figures, units in their names; None where there are no vectors, or none with an uncertainty."""
@@ -86,14 +97,8 @@ def quality_of(field: VectorField) -> Quality:
         sigma = field.uncertainty_voxel
     known = finite & np.isfinite(sigma).all(axis=-1)
     median = np.median(sigma[known], axis=0) if known.any() else np.full(3, np.nan)
-    return Quality(
-        field.flag.size,
-        int(used.sum()),
-        int(np.count_nonzero(used & (field.flag != VALID))),
-        int(finite.sum()),
-        int(np.count_nonzero(finite & ~known)),
-        median[np.newaxis],
-    )
+    in_doubt, without = (int(np.count_nonzero(each)) for each in (used & (field.flag != VALID), finite & ~known))
+    return Quality(field.flag.size, int(used.sum()), in_doubt, int(finite.sum()), without, median[np.newaxis])
 
 
 def quality_of_all(parts: Sequence[Quality]) -> Quality:
@@ -101,6 +106,34 @@ def quality_of_all(parts: Sequence[Quality]) -> Quality:
     names = ("vectors", "used", "in_doubt", "finite", "without")
     sums = {name: sum(getattr(part, name) for part in parts) for name in names}
     return Quality(**sums, sigma=np.concatenate([np.zeros((0, 3)), *(part.sigma for part in parts)]))
+
+
+def figures_of(fields: Mapping[str, Sequence[Path]]) -> dict[str, dict[str, float | int | None]]:
+    """Return how many vectors each method gives, how good they are and what they range over: figures by method.
+
+    Files are read one after the other.
+    """
+    told: dict[str, dict[str, float | int | None]] = {}
+    for method, paths in fields.items():
+        if not paths:
+            continue
+        qualities, displacements, valid = [], [], 0
+        for path in paths:
+            field = open_vectors(path)
+            qualities.append(quality_of(field))
+            displacements.append(field.displacement_voxel[field.flag < REJECTED])
+            valid += int(np.count_nonzero(field.flag == VALID))
+        quality, moved = quality_of_all(qualities), np.concatenate(displacements)
+        ends = LEFT_OUT_PERCENT, 100.0 - LEFT_OUT_PERCENT
+        low, high = np.percentile(moved, ends, axis=0) if len(moved) else np.full((2, 3), np.nan)
+        sigma = np.median(quality.sigma, axis=0) if len(quality.sigma) else np.full(3, np.nan)
+        figures: dict[str, float | int | None] = {"vectors": quality.vectors, "valid": valid}
+        for k, name in enumerate("uvw"):
+            ranges = {"from": low[k], "to": high[k], "sigma": sigma[k]}
+            figures |= {f"{name}_{what}_voxel": without_nan(value) for what, value in ranges.items()}
+        for name, value in figures.items():
+            told.setdefault(name, {})[method] = value
+    return told
 
 
 def field_notices(quality: Quality, name: str) -> Iterator[Notice]:
@@ -150,14 +183,8 @@ def window_notices(volume: Volume, settings: CorrelationSettings, name: str) -> 
             f"{shape[fewest]}: vectors along that axis: {layout.count[fewest]}"
         )
         remedy = f"windows as [x, y, z] with fewer voxels along {axis}, or window_mm"
-        yield Notice(
-            "windows-too-large",
-            WINDOWS,
-            text,
-            remedy,
-            float(layout.count[fewest]),
-            f"at least {FEWEST_ALONG_AXIS} vectors",
-        )
+        expected = f"at least {FEWEST_ALONG_AXIS} vectors"
+        yield Notice("windows-too-large", WINDOWS, text, remedy, float(layout.count[fewest]), expected)
     tracers = tracers_per_window(volume.array, layout)
     if tracers < FEWEST_TRACERS:
         text = (
@@ -185,16 +212,11 @@ def calibration_notices(records: Mapping[str, Mapping[str, Any]]) -> list[Notice
     """Return whether results, given as their records by name, were made with different calibrations."""
     known = [(name, calibrated_with(made)) for name, made in records.items()]
     known = [(name, calibration) for name, calibration in known if calibration is not None]
-    return [
-        Notice(
-            "other-calibration",
-            name,
-            f"was made with another calibration than {known[0][0]}: what moved between the two counts as motion",
-            "reconstruct all with one calibration",
-        )
-        for name, calibration in known
-        if calibration != known[0][1]
-    ]
+    if not known:
+        return []
+    text = f"was made with another calibration than {known[0][0]}: what moved between the two counts as motion"
+    remedy, others = "reconstruct all with one calibration", [name for name, each in known if each != known[0][1]]
+    return [Notice("other-calibration", name, text, remedy) for name in others]
 
 
 def few_notices(
@@ -202,30 +224,15 @@ def few_notices(
 ) -> list[Notice]:
     """Return which frames hold few particles or none, and whether any could be followed."""
     fullest, named = max(counts), list(zip(names, counts, strict=True))
-    notices = [
-        Notice(
-            "frame-without-particles",
-            name,
-            "there are no particles in it: no track passes there",
-            "compare exposure, mask and background of the images, or leave the frame out",
-            0.0,
-            "some",
-        )
-        for name, count in named
-        if not count
-    ]
-    notices += [
-        Notice(
-            "frame-with-few-particles",
-            name,
-            f"holds {count} particles, another frame {fullest}, most of which have no partner",
-            "compare exposure, mask and background of the images",
-            float(count),
-            f"at least {ONE_SIDED * fullest:g}",
-        )
-        for name, count in named
-        if 0 < count < ONE_SIDED * fullest
-    ]
+    text = "there are no particles in it: no track passes there"
+    remedy = "compare exposure, mask and background of the images, or leave the frame out"
+    empty = [name for name, count in named if not count]
+    notices = [Notice("frame-without-particles", name, text, remedy, 0.0, "some") for name in empty]
+    remedy, expected = "compare exposure, mask and background of the images", f"at least {ONE_SIDED * fullest:g}"
+    for name, count in named:
+        if 0 < count < ONE_SIDED * fullest:
+            text = f"holds {count} particles, another frame {fullest}, most of which have no partner"
+            notices.append(Notice("frame-with-few-particles", name, text, remedy, float(count), expected))
     if fullest < FEW:
         text = f"{fullest} particles at most in a frame: below {FEW} neighbours do not tell wrong links"
         remedy = "judge the links by themselves, or find more particles"
@@ -273,3 +280,141 @@ def still_notices(tracks: PointRows, name: str) -> list[Notice]:
     text = "nothing moves from it to the next frame, not even by chance: both are one and the same image"
     remedy = "check that the images are two"
     return [Notice("frames-alike", name, text, remedy, moved, f"above {STILL_SIGMAS:g} standard errors")]
+
+
+Word = Literal["good", "look", "no"]
+Part = Literal["calibration", "images", "vectors"]
+# From the best to the worst.
+WORDS: tuple[Word, ...] = ("good", "look", "no")
+PARTS: tuple[Part, ...] = ("calibration", "images", "vectors")
+
+# What makes a result worthless, and what is said for information.
+WORTHLESS = {
+    "light-off-lens-images",
+    "dark-lit",
+    "frame-uniform",
+    "frame-dark",
+    "light-unexplained",
+    "no-particles",
+    "no-tracks",
+    "frames-alike",
+    "other-calibration",
+    "volumes-alike",
+    "volumes-unlike",
+}
+FOR_INFORMATION = {"heavy-work", "particle-diameter-limit"}
+# What does so where it measures more than this.
+WORTHLESS_BEYOND = {"frame-saturated": MOST_SATURATED}
+# The commands whose warnings are of the calibration, and of the images; those of all others are of the vectors.
+CALIBRATES = ("calibrate-snapshot", "refine-calibration")
+OF_CALIBRATION = (*CALIBRATES, "build-weights")
+OF_IMAGES = ("reconstruct", "find_particles", "follow")
+# Errors are taken for larger than stated from here on: the ratios scatter by some tenths where windows share tracers.
+LARGEST_OVER_STATED = 3.0
+# Vectors that are shorter than so many standard deviations on every axis show no flow.
+SHORTEST_SIGMAS = 3.0
+# A component tells little whose usual stated error is a larger share of the usual displacement.
+LARGEST_SHARE = 0.25
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What is thought of a part: the worst of its reasons' words."""
+
+    part: Part
+    word: Word
+    reasons: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Reason:
+    """One thing that speaks for or against a part."""
+
+    part: Part
+    word: Word
+    text: str
+
+
+def verdicts(reasons: Iterable[Reason], made: Iterable[Part]) -> list[Verdict]:
+    """Return the verdict of each part that was made, its worst reasons first."""
+    by_part = {part: [each for each in reasons if each.part == part] for part in PARTS}
+    found = []
+    for part in made:
+        worst_first = sorted(by_part[part], key=lambda each: -WORDS.index(each.word))
+        word = worst_first[0].word if worst_first else "good"
+        found.append(Verdict(part, word, tuple(each.text for each in worst_first)))
+    return found
+
+
+def of_warnings(records: Mapping[str, Mapping[str, Any]]) -> list[Reason]:
+    """Return what the warnings say that the records of files hold, by the files' names; each once, with its count."""
+    seen: dict[tuple[Part, str], list[tuple[str, Mapping[str, Any]]]] = {}
+    for name, made in records.items():
+        verb = verb_of(made)
+        part: Part = "calibration" if verb in OF_CALIBRATION else "images" if verb in OF_IMAGES else "vectors"
+        for warning in made.get("warnings", ()):
+            seen.setdefault((part, warning["code"]), []).append((name, warning))
+    reasons = []
+    for (part, _), those in seen.items():
+        first, files = those[0][1], len({name for name, _ in those})
+        more = f" (and {files - 1} more)" if files > 1 else ""
+        word = max((word_of(warning) for _, warning in those), key=WORDS.index)
+        reasons.append(Reason(part, word, f"{first['about']}: {first['text']}{more}; {first['remedy']}"))
+    return reasons
+
+
+def verb_of(made: Mapping[str, Any]) -> str:
+    """Return the command of a record without its options."""
+    return str(made.get("command")).split(" ")[0]
+
+
+def word_of(warning: Mapping[str, Any]) -> Word:
+    """Return what is thought of a result by one warning's record alone."""
+    code, measured = warning["code"], warning.get("measured")
+    if code in WORTHLESS or (code in WORTHLESS_BEYOND and measured is not None and measured > WORTHLESS_BEYOND[code]):
+        return "no"
+    return "good" if code in FOR_INFORMATION else "look"
+
+
+def of_vectors(field: VectorField, name: str) -> list[Reason]:
+    """Return what a field says of itself."""
+    used, there = field.flag < MASKED, field.flag < REJECTED
+    if not there.any():
+        return [Reason("vectors", "no", f"{name}: no vector is left")]
+    share = np.count_nonzero(there) / np.count_nonzero(used)
+    reasons = [Reason("vectors", "good", f"{name}: {np.count_nonzero(there)} vectors, {share:.0%} of the places")]
+    if field.uncertainty_voxel is not None:
+        long = np.abs(field.displacement_voxel[there]) > SHORTEST_SIGMAS * field.uncertainty_voxel[there]
+        if np.mean(long.any(axis=1)) < 0.5:
+            text = f"{name}: most displacements are within {SHORTEST_SIGMAS:g} standard deviations of zero"
+            reasons.append(Reason("vectors", "look", f"{text}; a longer time between the images would show the flow"))
+        else:
+            # Components that are known too badly to tell much of the flow.
+            usual_mm = float(np.median(np.linalg.norm(field.displacement_voxel[there] * field.voxel_mm, axis=1)))
+            sigma_voxel = field.uncertainty_voxel[there]
+            known = sigma_voxel[np.isfinite(sigma_voxel).all(axis=1)]
+            sigma_mm = np.median(known, axis=0) * field.voxel_mm if len(known) else np.zeros(3)
+            for component, sigma in zip("uvw", sigma_mm, strict=True):
+                if sigma > LARGEST_SHARE * usual_mm > 0.0:
+                    text = (
+                        f"{name}: {component} is known to {written(sigma, 2)} mm, {sigma / usual_mm:.0%} of the usual "
+                        "displacement; particles in place of volumes, or a longer time between the images, tell more"
+                    )
+                    reasons.append(Reason("vectors", "look", text))
+    ratio = divergence_over_stated(field)
+    if ratio is not None and ratio > LARGEST_OVER_STATED:
+        text = f"{name}: the divergence is {ratio:.1f} times what the stated errors make, and a liquid has none"
+        reasons.append(
+            Reason("vectors", "look", f"{text}: errors are larger than stated, or the flow finer than windows")
+        )
+    return reasons
+
+
+def of_two_ways(one: VectorField, other: VectorField, names: tuple[str, str]) -> list[Reason]:
+    """Return what two measurements of one flow say of each other."""
+    ratios = difference_over_stated(one, other)
+    if ratios is None:
+        return []
+    told = ", ".join(f"{ratio:.1f}" for ratio in ratios)
+    text = f"{names[0]} and {names[1]} differ by {told} (u, v, w) times what their stated errors let expect"
+    return [Reason("vectors", "look" if max(ratios) > LARGEST_OVER_STATED else "good", text)]

@@ -39,14 +39,8 @@ def combine_vectors(
             return {"vectors": vtkhdf.open_vectors(output).flag.size}
         overwrite = True
     found = combine(*(vtkhdf.open_vectors(path) for path in inputs.values()))
-    vtkhdf.write_vectors(
-        output,
-        found.field,
-        headers[0].reference,
-        provenance=made,
-        overwrite=overwrite,
-        extra={"share_a": (found.first_share, "1"), "disagreement": (found.disagreement, "1")},
-    )
+    extra = {"share_a": (found.first_share, "1"), "disagreement": (found.disagreement, "1")}
+    vtkhdf.write_vectors(output, found.field, headers[0].reference, provenance=made, overwrite=overwrite, extra=extra)
     return {
         "vectors": found.field.flag.size,
         "weighted": int(np.count_nonzero(np.isfinite(found.disagreement) & ~found.left_out)),

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
+from dataclasses import fields as fields_of
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -14,22 +15,13 @@ from numpy.typing import NDArray
 
 from lfpiv_cli.console import CONSOLE, Console, Frames
 from lfpiv_cli.errors import InputError, LfpivError, UsageError
-from lfpiv_cli.files import vtkhdf
+from lfpiv_cli.files import provenance, vtkhdf
 from lfpiv_cli.files.atomic import ensure_writable, folder_of
 from lfpiv_cli.files.batch import Target, output_paths
 from lfpiv_cli.files.config import Config, carried_config, load_config
 from lfpiv_cli.files.hdf5 import ensure_opens, fault_of
 from lfpiv_cli.files.inputs import ensure_room, given
 from lfpiv_cli.files.pairing import Pairs
-from lfpiv_cli.files.provenance import (
-    OF_FRAMES,
-    earlier_record,
-    ensure_agreement,
-    even_step_s,
-    record,
-    seconds_between,
-    with_warnings,
-)
 from lfpiv_cli.files.sections_simulated import CorrelationKeys
 from lfpiv_cli.files.vtkhdf import Volume
 from lfpiv_cli.flow import correlation
@@ -39,22 +31,13 @@ from lfpiv_cli.flow.field import REJECTED, VectorField, derived_fields
 from lfpiv_cli.flow.peaks import with_locking
 from lfpiv_cli.flow.windows import inside
 from lfpiv_cli.grid import Grid
-from lfpiv_cli.notice import Notice, warn_of
-from lfpiv_cli.reference import FOCAL_POINT, Reference
-from lfpiv_cli.scale import Scale
-from lfpiv_cli.verbs.batches import ALL, BatchOptions, Expected, Worked, dry_run, work_through
-from lfpiv_cli.verbs.checks import (
-    Quality,
-    calibration_notices,
-    field_notices,
-    pair_notices,
-    quality_of,
-    quality_of_all,
-    window_notices,
-)
+from lfpiv_cli.notice import warn_of
+from lfpiv_cli.reference import FOCAL_POINT
+from lfpiv_cli.verbs import checks
+from lfpiv_cli.verbs.batches import ALL, BatchOptions, Expected, Failure, Worked, dry_run, work_through
+from lfpiv_cli.verbs.fields import Mean, are_measured, arrays_of, mean_of_measured
 from lfpiv_cli.verbs.frames import dt_notices
-from lfpiv_cli.verbs.means import Mean, are_measured, arrays_of, mean_of_measured
-from lfpiv_cli.verbs.pairs import ComingPairs, PairBatch, PairBatchOptions, result_pairs, watched, work_as_they_come
+from lfpiv_cli.verbs.pairs import PairBatch, PairBatchOptions, coming_pairs, result_pairs, watched, work_as_they_come
 
 
 def correlate(
@@ -104,16 +87,11 @@ def correlate(
     field = correlation.correlate([(first.array, second.array)], first.grid, windows, mask=usable)
     if config:
         # Of light that no camera recorded nothing is known.
-        field = with_locking(field, first.reference, scale_of(chosen))
-    quality, name = quality_of(field), "the field"
-    against_field = [*field_notices(quality, name), *pair_notices(field, quality, name)]
-    warn_of([*window_notices(first, windows, "the first volume"), *against_field])
+        field = with_locking(field, first.reference, chosen.camera_model().scale(chosen.media_model()))
+    quality, name = checks.quality_of(field), "the field"
+    against_field = [*checks.field_notices(quality, name), *checks.pair_notices(field, quality, name)]
+    warn_of([*checks.window_notices(first, windows, "the first volume"), *against_field])
     return field
-
-
-def scale_of(settings: Config) -> Scale:
-    """Return the lengths in the scene of the camera that volumes were made of."""
-    return settings.camera_model().scale(settings.media_model())
 
 
 def usable_voxels(settings: Config, grid: Grid, mask: NDArray[Any] | None) -> NDArray[np.bool_] | None:
@@ -127,17 +105,12 @@ def usable_voxels(settings: Config, grid: Grid, mask: NDArray[Any] | None) -> ND
 
 
 def ensure_alike(first: Volume, second: Volume, names: tuple[str, str]) -> None:
-    """Refuse two volumes that were not made alike.
-
-    Raises
-    ------
-    InputError
-    """
+    """Refuse two volumes that were not made alike (InputError)."""
     if first.grid != second.grid:
         raise InputError(f"{names[1]}: its grid {second.grid} differs from that of {names[0]}, {first.grid}")
     if first.reference.name != second.reference.name:
         raise InputError(f"{names[1]}: its coordinates have another origin than those of {names[0]}")
-    ensure_agreement([first.provenance, second.provenance], names, OF_FRAMES)
+    provenance.ensure_agreement([first.provenance, second.provenance], names, provenance.OF_FRAMES)
 
 
 def _as_volume(volume: Volume | NDArray[Any], voxel_mm: tuple[float, float, float] | None) -> Volume:
@@ -155,24 +128,6 @@ def _as_volume(volume: Volume | NDArray[Any], voxel_mm: tuple[float, float, floa
 
 # Numbers of eight bytes that a file has of each vector at most, and derived ones besides.
 NUMBERS_A_VECTOR, NUMBERS_DERIVED, NUMBER_BYTES = 16, 6, 8
-
-
-@dataclass(frozen=True)
-class Job:
-    """One result: the pairs of volumes that it is made of, and the settings."""
-
-    pairs: Sequence[tuple[Path, Path]]
-    settings: Config
-
-    def inputs(self) -> dict[str, Path]:
-        """Return the volumes by their role."""
-        if len(self.pairs) == 1:
-            return given(volume_a=self.pairs[0][0], volume_b=self.pairs[0][1])
-        return {
-            f"volume_{name}_{number:04d}": path
-            for number, pair in enumerate(self.pairs)
-            for name, path in zip("ab", pair, strict=True)
-        }
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -207,14 +162,18 @@ def correlate_files(
     *,
     overwrite: bool = False,
     console: Console = CONSOLE,
-    pairs: Pairs | None = None,
 ) -> dict[str, Any]:
-    """Measure the displacements between pairs of volumes; `pairs`, where they are known already.
+    """Measure the displacements between pairs of volumes.
 
     Of vectors and tracks that are there, in place of volumes, only the `mean` is made.
     """
     if options.mean is not None and not options.watch and are_measured(volumes):
-        _ensure_for_mean(options, volumes[0])
+        for each in fields_of(options):
+            if each.compare and each.name not in FOR_MEANS and getattr(options, each.name) != each.default:
+                name = each.name.removesuffix("_volume").replace("_", "-")
+                raise UsageError(
+                    f"--{name}: is for volumes; the mean of {volumes[0]} and those beside it has no use for it"
+                )
         if output is not None:
             console.say(f"{output}: is not written: the vectors are there, and --mean alone is made of them")
         return mean_of_measured(volumes, options.mean, options, options.derived, overwrite, console)
@@ -223,7 +182,7 @@ def correlate_files(
     if options.watch:
         batch, worked = _as_they_come(volumes, output, options, overwrite, console)
         return worked.ensure_whole(batch.summary(worked), batch.unit)
-    batch = Correlation(volumes, output, options, overwrite, pairs)
+    batch = Correlation(volumes, output, options, overwrite)
     if options.dry_run:
         return dry_run(batch, options, console)
     worked = work_through(batch, options, console)
@@ -233,19 +192,6 @@ def correlate_files(
         # What another worker made of the same fields in the meantime is as good.
         work_through(mean, BatchOptions(resume=True), console)
     return worked.ensure_whole(batch.summary(worked), batch.unit)
-
-
-def _ensure_for_mean(options: CorrelateOptions, first: Path) -> None:
-    """Refuse options that the mean of vectors that are there has no use for.
-
-    Raises
-    ------
-    UsageError
-    """
-    for each in fields(options):
-        if each.compare and each.name not in FOR_MEANS and getattr(options, each.name) != each.default:
-            name = each.name.removesuffix("_volume").replace("_", "-")
-            raise UsageError(f"--{name}: is for volumes; the mean of {first} and those beside it has no use for it")
 
 
 def _as_they_come(
@@ -262,22 +208,23 @@ def _as_they_come(
         raise UsageError(f"--watch: {refused} is made from all pairs, some of which have not come yet; wait for them")
     if not options.are_told:
         raise UsageError("--watch needs --pairing: ab or sequence")
-    coming = ComingPairs(lambda files: result_pairs(files, options), console)
+    left_out: list[Failure] = []
 
     def of_pairs(files: Sequence[Path]) -> Correlation:
         two_by_two = tuple((number, number + 1) for number in range(0, len(files), 2))
         return Correlation(files, output, options, overwrite, Pairs(two_by_two))
 
-    groups = coming.groups(watched(folders, "results", options, console))
+    coming = watched(folders, "results", options, console)
+    groups = coming_pairs(coming, lambda files: result_pairs(files, options), console, left_out)
     with folder_of(output / folders[0].name):
-        return work_as_they_come(of_pairs, groups, options, console, lambda: coming.left_out)
+        return work_as_they_come(of_pairs, groups, options, console, left_out)
 
 
 @dataclass(frozen=True)
 class Outcome:
     """What is told of a field: how good it is, how many vectors are rejected, and the divergence where it is asked."""
 
-    quality: Quality
+    quality: checks.Quality
     rejected: int
     divergence_rms: float | None = None
 
@@ -305,7 +252,21 @@ class Correlation(PairBatch[Outcome, CorrelateOptions]):
         paths = output_paths(output, [group[0][0].stem for group in self._groups])
         self.targets = [Target(path, partial(self._record, number)) for number, path in enumerate(paths)]
         self.beside = [options.mean] if options.mean else []
-        self._first = files[0] if self._gone else _ensure_readable(files, options.keep_going)
+        # The first volume that can be opened, after it is known whether the others can, where one is to stop.
+        readable: list[Path] = []
+        fault: InputError | None = None
+        for path in () if self._gone else files:
+            try:
+                ensure_opens(path)
+            except InputError as error:
+                if not options.keep_going:
+                    raise
+                fault = fault or error
+            else:
+                readable.append(path)
+        if fault is not None and not readable:
+            raise fault
+        self._first = (readable or files)[0]
 
     def fault(self, number: int) -> str | None:
         """Return why a volume of a field cannot be opened."""
@@ -322,36 +283,52 @@ class Correlation(PairBatch[Outcome, CorrelateOptions]):
         if self._options.mean is not None:
             ensure_writable(self._options.mean, self.overwrite or self._options.resume)
         if numbers and not self._gone:
-            ensure_room(self._held(), self.label)
+            try:
+                held = self.expected().memory_bytes or 0.0
+            except LfpivError:
+                held = 0.0  # its volume cannot be read, which is told in its turn
+            ensure_room(held, self.label)
         return 1.0
-
-    def _held(self) -> float:
-        """Return what a field takes in memory; 0 where its volume cannot be read, which is told in its turn."""
-        try:
-            return self.expected().memory_bytes or 0.0
-        except LfpivError:
-            return 0.0
 
     def make(self, number: int, work: Frames) -> Outcome:
         """Correlate a pair, or all of them, and write the vectors."""
         target = self.targets[number]
-        job = self._job(number)
-        field, reference, notices = _measure(job, self._options.mask_volume, work)
-        quality, name = quality_of(field), target.path.name
-        records = ([self._record_of(path) for path in pair] for pair in job.pairs)
-        notices += dt_notices(job.settings.correlation.dt_s, records, name)
-        notices += [*field_notices(quality, name), *pair_notices(field, quality, name)]
+        config, pairs, mask = self._settings_for(number), self._groups[number], self._options.mask_volume
+        one = pairs[0][0]
+        first, drawn = vtkhdf.open_volume(one), None if mask is None else vtkhdf.open_volume(mask)
+        if drawn is not None and drawn.grid != first.grid:
+            raise InputError(f"{mask}: its grid {drawn.grid} differs from that of {one}, {first.grid}")
+
+        def volumes() -> Iterator[tuple[NDArray[np.float32], NDArray[np.float32]]]:
+            for pair in pairs:
+                a, b = (first if path == one else vtkhdf.open_volume(path) for path in pair)
+                for path, volume in zip(pair, (a, b), strict=True):
+                    ensure_alike(first, volume, (str(one), str(path)))
+                yield a.array, b.array
+
+        usable = usable_voxels(config, first.grid, None if drawn is None else drawn.array)
+        settings = config.correlation_settings(first.grid.spacing_mm)
+        of_volumes = {
+            f"{role} {path.name}": provenance.earlier_record(path) or {} for role, path in self._volumes(number).items()
+        }
+        notices = [*checks.calibration_notices(of_volumes), *checks.window_notices(first, settings, one.name)]
+        share = 1.0 / count_passes(settings.windows)
+        field = measure(
+            volumes(), first.grid, settings, mask=usable, progress=lambda passes: work.advance(share * passes)
+        )
+        camera, media = config.camera_model(), config.media_model()
+        field = with_locking(field, first.reference, camera.scale(media))
+        quality, name = checks.quality_of(field), target.path.name
+        records = ([self._record_of(path) for path in pair] for pair in pairs)
+        notices += dt_notices(config.correlation.dt_s, records, name)
+        notices += [*checks.field_notices(quality, name), *checks.pair_notices(field, quality, name)]
         work.console.warn(notices)
         derived = derived_fields(field) if self._options.derived else None
-        vtkhdf.write_vectors(
-            target.path,
-            field,
-            reference,
-            provenance=with_warnings(target.record, notices),
-            # What is complete is skipped: in the place of what is made there is nothing, or something broken.
-            overwrite=self.overwrite or self._options.resume,
-            extra=arrays_of(derived) if derived else None,
-        )
+        made = provenance.with_warnings(target.record, notices)
+        extra = arrays_of(derived) if derived else None
+        # What is complete is skipped: in the place of what is made there is nothing, or something broken.
+        replacing = self.overwrite or self._options.resume
+        vtkhdf.write_vectors(target.path, field, first.reference, provenance=made, overwrite=replacing, extra=extra)
         rejected = int(np.count_nonzero(field.flag >= REJECTED))
         return Outcome(quality, rejected, derived.divergence_rms if derived else None)
 
@@ -369,27 +346,33 @@ class Correlation(PairBatch[Outcome, CorrelateOptions]):
         """Those of the first volume that can be opened."""
         return self._settings_of(self._first)
 
-    def _job(self, number: int) -> Job:
-        """Return the pairs that a field is made of, and the settings."""
+    def _volumes(self, number: int) -> dict[str, Path]:
+        """Return the volumes that a field is made of by their role."""
+        pairs = self._groups[number]
+        if len(pairs) == 1:
+            return given(volume_a=pairs[0][0], volume_b=pairs[0][1])
+        return {
+            f"volume_{name}_{place:04d}": path
+            for place, pair in enumerate(pairs)
+            for name, path in zip("ab", pair, strict=True)
+        }
+
+    def _settings_for(self, number: int) -> Config:
+        """Return the settings that a field is made with."""
         group = self._groups[number]
         settings = self._settings_of(group[0][0])
         if settings.correlation.dt_s is None:
-            settings = settings.overridden("correlation", dt_s=self._step_s(group))
-        return Job(group, settings)
-
-    def _step_s(self, group: Sequence[tuple[Path, Path]]) -> float | None:
-        """Return the time within the pairs of a field, where the recordings of their frames tell it.
-
-        Raises
-        ------
-        InputError : it is not the same in all of them
-        """
-        steps = [seconds_between(self._record_of(first), self._record_of(second)) for first, second in group]
-        return even_step_s(steps, [str(group[0][0]), str(group[-1][1])])
+            # Where the recordings of the frames of all pairs tell it: the same in all of them.
+            steps = [
+                provenance.seconds_between(self._record_of(first), self._record_of(second)) for first, second in group
+            ]
+            step_s = provenance.even_step_s(steps, [str(group[0][0]), str(group[-1][1])])
+            settings = settings.overridden("correlation", dt_s=step_s)
+        return settings
 
     def _record_of(self, volume: Path) -> Mapping[str, Any]:
         """Return the record of a volume, which may be gone."""
-        return self._gone[volume].record if volume in self._gone else earlier_record(volume) or {}
+        return self._gone[volume].record if volume in self._gone else provenance.earlier_record(volume) or {}
 
     def _settings_of(self, volume: Path) -> Config:
         """Return the settings for a volume: its own, or those of a config in their place."""
@@ -398,9 +381,10 @@ class Correlation(PairBatch[Outcome, CorrelateOptions]):
 
     def _record(self, number: int) -> dict[str, Any]:
         """Return the record that a field will carry."""
-        options, job = self._options, self._job(number)
+        options = self._options
         command = " ".join(["correlate", *["ensemble"] * options.ensemble, *["derived"] * options.derived])
-        return record(command, job.settings.resolved(), self._common | job.inputs(), gone=self._gone)
+        inputs = self._common | self._volumes(number)
+        return provenance.record(command, self._settings_for(number).resolved(), inputs, gone=self._gone)
 
 
 def field_bytes(settings: Config, grid: Grid, derived: bool = False) -> float:
@@ -412,7 +396,7 @@ def field_bytes(settings: Config, grid: Grid, derived: bool = False) -> float:
 def summary_of(worked: Worked[Outcome], pairs: int) -> dict[str, Any]:
     """Return what is told of the fields of so many pairs."""
     outcomes = list(worked.outcomes.values())
-    found = quality_of_all([outcome.quality for outcome in outcomes])
+    found = checks.quality_of_all([outcome.quality for outcome in outcomes])
     told: dict[str, Any] = {
         "pairs": pairs,
         "skipped": worked.skipped,
@@ -421,49 +405,3 @@ def summary_of(worked: Worked[Outcome], pairs: int) -> dict[str, Any]:
     }
     divergence = [outcome.divergence_rms for outcome in outcomes if outcome.divergence_rms is not None]
     return told | found.summary() | ({"divergence_rms_per_s": float(np.mean(divergence))} if divergence else {})
-
-
-def _measure(job: Job, mask: Path | None, work: Frames) -> tuple[VectorField, Reference, list[Notice]]:
-    """Return the vectors of a job, the origin of its volumes' coordinates, and what speaks against its windows."""
-    first = vtkhdf.open_volume(job.pairs[0][0])
-    drawn = None if mask is None else vtkhdf.open_volume(mask)
-    if drawn is not None and drawn.grid != first.grid:
-        raise InputError(f"{mask}: its grid {drawn.grid} differs from that of {job.pairs[0][0]}, {first.grid}")
-
-    def volumes() -> Iterator[tuple[NDArray[np.float32], NDArray[np.float32]]]:
-        for pair in job.pairs:
-            a, b = (first if path == job.pairs[0][0] else vtkhdf.open_volume(path) for path in pair)
-            for path, volume in zip(pair, (a, b), strict=True):
-                ensure_alike(first, volume, (str(job.pairs[0][0]), str(path)))
-            yield a.array, b.array
-
-    usable = usable_voxels(job.settings, first.grid, None if drawn is None else drawn.array)
-    settings = job.settings.correlation_settings(first.grid.spacing_mm)
-    records = {f"{role} {path.name}": earlier_record(path) or {} for role, path in job.inputs().items()}
-    notices = [*calibration_notices(records), *window_notices(first, settings, job.pairs[0][0].name)]
-    share = 1.0 / count_passes(settings.windows)
-    field = measure(volumes(), first.grid, settings, mask=usable, progress=lambda passes: work.advance(share * passes))
-    field = with_locking(field, first.reference, scale_of(job.settings))
-    return field, first.reference, notices
-
-
-def _ensure_readable(volumes: Sequence[Path], keep_going: bool) -> Path:
-    """Return the first volume that can be opened, after it is known whether the others can, where one is to stop.
-
-    Raises
-    ------
-    InputError : one cannot, or with `keep_going` none
-    """
-    readable, first_fault = [], None
-    for path in volumes:
-        try:
-            ensure_opens(path)
-        except InputError as error:
-            if not keep_going:
-                raise
-            first_fault = first_fault or error
-        else:
-            readable.append(path)
-    if not readable and first_fault is not None:
-        raise first_fault
-    return readable[0]

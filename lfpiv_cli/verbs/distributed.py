@@ -77,8 +77,24 @@ def made_by_workers(
     """
     if not before:
         return
-    kept = _Kept(batch, list(before), told_threads() or 1)
-    with _connected(address, kept, console) as client:
+    kept, local = _Kept(batch, list(before), told_threads() or 1), LOCAL.fullmatch(address)
+    with ExitStack() as stack:
+        try:
+            if local is not None:
+                address = stack.enter_context(_own_cluster(int(local[1] or 0)))
+            client = stack.enter_context(Client(address, timeout=CONNECT_S, set_as_default=False))
+        except (OSError, ValueError) as error:
+            raise UsageError(f"--dask {address}: no scheduler answers: {reason(error)}") from error
+        client.register_plugin(kept)
+
+        @stack.callback
+        def leave() -> None:
+            """Have the workers let go of what they keep, if they can be reached."""
+            with contextlib.suppress(OSError, ValueError):
+                client.unregister_worker_plugin(kept.name)
+
+        if not client.nthreads():
+            console.say(f"--dask {address}: waits for workers")
         outputs = _Outputs(client, kept.name, before, batch.names, console)
         try:
             for number, reply in outputs.as_done(deadline):
@@ -113,29 +129,23 @@ class _Kept(WorkerPlugin):
         with self._alone:
             use_threads(self._threads)
             try:
-                self._ensure_alike()
+                if lfpiv_cli.__version__ != self._version:
+                    raise UsageError(
+                        f"--dask: a worker has lfpiv {lfpiv_cli.__version__}, this command is {self._version}"
+                    )
+                if not self._folder.is_dir():
+                    raise UsageError(f"--dask: a worker does not see {self._folder}: it needs the disk of this command")
                 # Paths mean what they mean to the command.
                 with contextlib.chdir(self._folder):
-                    batch = self._begun(console)
-                    made = attempt(batch, number, before, Frames(console, 1, 1.0, batch.label, batch.unit))
+                    if self._batch is None:
+                        batch: Batch[Any] = pickle.loads(self._arguments)
+                        batch.begin(self._numbers, console)
+                        self._batch = batch
+                    work = Frames(console, 1, 1.0, self._batch.label, self._batch.unit)
+                    made = attempt(self._batch, number, before, work)
             except LfpivError as error:
                 made = error
         return Reply(made, warned, time.monotonic() - begun)
-
-    def _begun(self, console: Console) -> Batch[Any]:
-        """Return the batch, ready for its outputs."""
-        if self._batch is None:
-            batch: Batch[Any] = pickle.loads(self._arguments)
-            batch.begin(self._numbers, console)
-            self._batch = batch
-        return self._batch
-
-    def _ensure_alike(self) -> None:
-        """Refuse a worker that would make something else."""
-        if lfpiv_cli.__version__ != self._version:
-            raise UsageError(f"--dask: a worker has lfpiv {lfpiv_cli.__version__}, this command is {self._version}")
-        if not self._folder.is_dir():
-            raise UsageError(f"--dask: a worker does not see {self._folder}: it needs the disk of this command")
 
 
 def _make(name: str, number: int, before: Stamp) -> Reply:
@@ -143,24 +153,6 @@ def _make(name: str, number: int, before: Stamp) -> Reply:
     kept = get_worker().plugins[name]
     assert isinstance(kept, _Kept)
     return kept.make(number, before)
-
-
-@contextmanager
-def _connected(address: str, kept: _Kept, console: Console) -> Iterator[Client]:
-    """Connect to a scheduler, or start workers here; they keep what they need until the end."""
-    with ExitStack() as stack:
-        local = LOCAL.fullmatch(address)
-        try:
-            if local is not None:
-                address = stack.enter_context(_own_cluster(int(local[1] or 0)))
-            client = stack.enter_context(Client(address, timeout=CONNECT_S, set_as_default=False))
-        except (OSError, ValueError) as error:
-            raise UsageError(f"--dask {address}: no scheduler answers: {reason(error)}") from error
-        client.register_plugin(kept)
-        stack.callback(_leave, client, kept.name)
-        if not client.nthreads():
-            console.say(f"--dask {address}: waits for workers")
-        yield client
 
 
 @contextmanager
@@ -180,12 +172,6 @@ def _own_cluster(workers: int) -> Iterator[str]:
         ) as cluster,
     ):
         yield cluster.scheduler_address
-
-
-def _leave(client: Client, name: str) -> None:
-    """Have the workers let go of what they keep, if they can be reached."""
-    with contextlib.suppress(OSError, ValueError):
-        client.unregister_worker_plugin(name)
 
 
 class _Outputs:
@@ -210,8 +196,18 @@ class _Outputs:
     def as_done(self, deadline: Deadline) -> Iterator[tuple[int, Reply]]:
         """Yield outputs as they are done."""
         while self._running or ((self._left or self._claimed) and deadline.leaves_time()):
-            workers = self._workers()
-            self._take_back(workers)
+            try:
+                workers = set(self._client.nthreads())
+            except OSError as error:
+                raise StoppedEarlyError(SCHEDULER_ENDED) from error
+            # What was given to workers that have ended is taken back.
+            for worker in {worker for _, worker in self._running.values()} - workers:
+                at_work, *waiting = [future for future, given in self._running.items() if given[1] == worker]
+                for future in waiting:
+                    if not future.done():
+                        self._left.put_back(self._let_go(future)[0])
+                if not at_work.done():
+                    self._worker_ended(at_work)
             if deadline.leaves_time():
                 self._hand_out(workers, deadline.leaves_time(2))
             for number, reply in self._done():
@@ -229,37 +225,6 @@ class _Outputs:
         if self._running:
             with contextlib.suppress(OSError):
                 self._client.cancel(list(self._running), force=True)
-
-    def _workers(self) -> set[str]:
-        """Return the workers that are there now."""
-        try:
-            return set(self._client.nthreads())
-        except OSError as error:
-            raise StoppedEarlyError(SCHEDULER_ENDED) from error
-
-    def _take_back(self, workers: set[str]) -> None:
-        """Take back what was given to workers that have ended."""
-        for worker in {worker for _, worker in self._running.values()} - workers:
-            at_work, *waiting = [future for future, given in self._running.items() if given[1] == worker]
-            for future in waiting:
-                if not future.done():
-                    self._left.put_back(self._let_go(future)[0])
-            if not at_work.done():
-                self._worker_ended(at_work)
-
-    def _let_go(self, future: Future) -> tuple[int, str]:
-        """Ask no longer for an output; return its number and its worker."""
-        self._client.cancel([future], force=True)
-        return self._running.pop(future)
-
-    def _worker_ended(self, future: Future) -> None:
-        """Leave an output to another worker than the one that ended at it, or give it up after some."""
-        number, worker = self._let_go(future)
-        self._ends[number] += 1
-        if self._ends[number] < WORKERS_GIVEN_UP:
-            text = f"the worker {worker} ended while it worked on it, which goes to another"
-            self._console.warn([Notice("worker-ended", self._names[number], text, "memory, or its time limit")])
-            self._left.put_back(number)
 
     def _hand_out(self, workers: set[str], ahead: bool) -> None:
         """Give each worker that has nothing to do an output; then one to go on with, if it is to be done `ahead`.
@@ -284,6 +249,20 @@ class _Outputs:
             future = self._client.submit(_make, self._kept, number, self._before[number], workers=[worker], pure=False)
             self._running[future] = number, worker
             future.add_done_callback(lambda _future: self._some_done.set())
+
+    def _let_go(self, future: Future) -> tuple[int, str]:
+        """Ask no longer for an output; return its number and its worker."""
+        self._client.cancel([future], force=True)
+        return self._running.pop(future)
+
+    def _worker_ended(self, future: Future) -> None:
+        """Leave an output to another worker than the one that ended at it, or give it up after some."""
+        number, worker = self._let_go(future)
+        self._ends[number] += 1
+        if self._ends[number] < WORKERS_GIVEN_UP:
+            text = f"the worker {worker} ended while it worked on it, which goes to another"
+            self._console.warn([Notice("worker-ended", self._names[number], text, "memory, or its time limit")])
+            self._left.put_back(number)
 
     def _done(self) -> Iterator[tuple[int, Reply]]:
         """Yield what is done, after a while at the latest."""

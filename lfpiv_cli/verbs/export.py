@@ -50,7 +50,10 @@ def export(
     ----------
     output : the file to write; where None, beside the file and named like it
     """
-    to, target = options.to, output or _beside(files, options.to)
+    if output is None and len(files) > 1:
+        raise UsageError(f"{len(files)} files go into one, whose name -o has to say")
+    to = options.to
+    target = output or files[0].with_name(files[0].stem + FORMATS[to].ending)
     ensure_writable(target, overwrite, files)
     first = _read(files[0], options.plane)
     ensure_fits(files[0], first.format_name, to, len(files))
@@ -60,7 +63,19 @@ def export(
     first = replace(first, provenance=made)
 
     def read(number: int) -> Content:
-        return first if number == 0 else _alike(first, files[0], _read(files[number], options.plane), files[number])
+        """Return the content of one time, which has the same arrays on the same grid as that of the first."""
+        if number == 0:
+            return first
+        path, other = files[number], _read(files[number], options.plane)
+        if (other.format_name, other.grid) != (first.format_name, first.grid):
+            raise InputError(f"{path}: holds {other.format_name} on {other.grid}, and {files[0]} does not")
+        if set(other.arrays) != set(first.arrays):
+            differing = ", ".join(sorted(set(other.arrays) ^ set(first.arrays)))
+            raise InputError(f"{path}: has other arrays than {files[0]}: {differing}")
+        ours, theirs = ({k: v for k, v in each.attributes.items() if k in SHARED} for each in (first, other))
+        if ours != theirs:
+            raise InputError(f"{path}: says {theirs}, and {files[0]} {ours}")
+        return other
 
     times = None if options.step_s is None else [options.step_s * number for number in range(len(files))]
     write = FORMATS[to].write
@@ -80,13 +95,6 @@ def export(
     }
 
 
-def _beside(files: Sequence[Path], to: ExportFormat) -> Path:
-    """Return where the result goes that was given no name."""
-    if len(files) > 1:
-        raise UsageError(f"{len(files)} files go into one, whose name -o has to say")
-    return files[0].with_name(files[0].stem + FORMATS[to].ending)
-
-
 def _read(path: Path, plane: int | None) -> Content:
     """Return a file's content, or one plane of it."""
     content = read_content(path)
@@ -100,21 +108,3 @@ def _read(path: Path, plane: int | None) -> Content:
     (nx, ny, _), (x, y, _) = content.grid.shape_xyz, content.grid.origin_mm
     grid = Grid((nx, ny, 1), content.grid.spacing_mm, (x, y, float(content.grid.axis_mm(2)[plane])))
     return replace(content, grid=grid, arrays={name: each[plane : plane + 1] for name, each in content.arrays.items()})
-
-
-def _alike(first: Content, first_path: Path, other: Content, path: Path) -> Content:
-    """Return the content of another time where it has the same arrays on the same grid.
-
-    Raises
-    ------
-    InputError
-    """
-    if (other.format_name, other.grid) != (first.format_name, first.grid):
-        raise InputError(f"{path}: holds {other.format_name} on {other.grid}, and {first_path} does not")
-    if set(other.arrays) != set(first.arrays):
-        differing = ", ".join(sorted(set(other.arrays) ^ set(first.arrays)))
-        raise InputError(f"{path}: has other arrays than {first_path}: {differing}")
-    ours, theirs = ({k: v for k, v in each.attributes.items() if k in SHARED} for each in (first, other))
-    if ours != theirs:
-        raise InputError(f"{path}: says {theirs}, and {first_path} {ours}")
-    return other

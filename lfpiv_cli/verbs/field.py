@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lfpiv_cli.arrays import Floats
 from lfpiv_cli.console import CONSOLE, Console
@@ -26,24 +25,12 @@ from lfpiv_cli.files.inputs import content_of
 from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, TRAJECTORIES_FORMAT, Points, read_points, read_tracks
 from lfpiv_cli.files.provenance import OF_COORDINATES, record, with_warnings
 from lfpiv_cli.flow.field import MASKED, MM_TO_M, REJECTED, VectorField
-from lfpiv_cli.flow.from_tracks import WindowGrid
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.names import Divergence
 from lfpiv_cli.tracks.candidates import NO_TRACK, Trajectories
 from lfpiv_cli.tracks.in_time import Motion, high_derivatives_in, motions_at
-from lfpiv_cli.verbs.fields import (
-    FittedField,
-    ensure_one_time,
-    fit_notices,
-    fitted,
-    samples_of_tracks,
-    samples_of_vectors,
-)
-from lfpiv_cli.verbs.means import Extra, arrays_of
-from lfpiv_cli.verbs.tracks import seen_in, settings_of
-
-# Pressure from a sequence's trajectories, in memory.
-
+from lfpiv_cli.verbs import fields
+from lfpiv_cli.verbs.tracks import seen_in, settings_of, windows_of
 
 MM2_PER_M2 = 1e6
 
@@ -98,15 +85,18 @@ def pressure_of(
         raise InputError(f"{len(particles)} frames: too few tracks pass five of them, which accelerations need")
     tracks, motion = motions_at(found, seen, number, derivatives)
     sure = link_probability(trajectories)[tracks]
-    moving = Samples(
-        motion.position_mm, motion.velocity, _velocity_covariance(trajectories, number, tracks, dt_s), sure
-    )
+    # The covariances (n, 3, 3) of the tracks' velocities in the frame, mm^2 per frame^2, as the file states.
+    here = np.flatnonzero(trajectories.arrays["frame"] == number)
+    row = here[np.searchsorted(trajectories.arrays["track"][here], tracks)]
+    sigma = trajectories.arrays["velocity_sigma"][row] * dt_s / MM_TO_M
+    moving = Samples(motion.position_mm, motion.velocity, sigma[:, :, np.newaxis] ** 2 * np.eye(3), sure)
     low, high = motion.position_mm.min(axis=0), motion.position_mm.max(axis=0)
     # mm^2/s times s per frame times mm per frame per mm^2
     friction = viscosity / density * MM2_PER_M2 * dt_s * pressure.laplacian_at(
         fit_field(moving, low, high), motion.position_mm
     )  # fmt: skip
     to_m_s2 = MM_TO_M / dt_s**2
+    neglected = neglected_share(motion)
     samples = pressure.pressure_gradients(
         motion.position_mm, to_m_s2 * (motion.acceleration - friction), to_m_s2**2 * motion.covariance, density, sure
     )
@@ -115,9 +105,9 @@ def pressure_of(
         "tracks": len(tracks),
         "acceleration_rms_m_s2": (to_m_s2 * _rms(motion.acceleration)).tolist(),
         "friction_share": float(np.linalg.norm(friction) / np.linalg.norm(motion.acceleration)),
-        "neglected_share": neglected_share(motion),
+        "neglected_share": neglected,
     }
-    return _on_windows(samples, settings, pressure.knots_for(samples.points_mm), neglected_share(motion), figures)
+    return _on_windows(samples, settings, pressure.knots_for(samples.points_mm), neglected, figures)
 
 
 def pressure_of_steady_flow(field: Field, dt_s: float, settings: Config) -> PressureResult:
@@ -179,14 +169,6 @@ def neglected_share(motion: Motion) -> float:
     return float(np.linalg.norm(motion.neglected) / np.linalg.norm(motion.acceleration))
 
 
-def _velocity_covariance(points: Points, number: int, tracks: NDArray[np.int64], dt_s: float) -> Floats:
-    """Return the covariances (n, 3, 3) of the tracks' velocities in a frame, mm^2 per frame^2, as the file states."""
-    here = np.flatnonzero(points.arrays["frame"] == number)
-    row = here[np.searchsorted(points.arrays["track"][here], tracks)]
-    sigma = points.arrays["velocity_sigma"][row] * dt_s / MM_TO_M
-    return np.asarray(sigma[:, :, np.newaxis] ** 2 * np.eye(3))
-
-
 def _rms(vectors: Floats) -> Floats:
     return np.asarray(np.sqrt(np.mean(vectors**2, axis=0)))
 
@@ -195,9 +177,7 @@ def _on_windows(
     samples: Samples, settings: Config, knot_mm: float, wrong_share: float, figures: dict[str, Any]
 ) -> PressureResult:
     """Fit the pressure and return it at the centres of the windows."""
-    volume = settings.grid()
-    windows = settings.windows_voxel(volume.spacing_mm)[-1]
-    grid = WindowGrid(volume, windows, settings.overlap(volume.spacing_mm)).centres
+    grid = windows_of(settings, None).centres
     nodes = grid.centres_mm()
     everywhere = np.concatenate([samples.points_mm, nodes.reshape(-1, 3)])
     lattice = Lattice.affordable(everywhere.min(axis=0), everywhere.max(axis=0), knot_mm)
@@ -257,18 +237,30 @@ def fit_flow(
     for header, name in zip(headers, names, strict=True):
         if header.reference != headers[0].reference:
             raise InputError(f"{name}: its coordinates have another origin than those of {names[0]}")
-    ensure_one_time(header.attributes.get("dt_s") for header in headers)
+    fields.ensure_one_time(header.attributes.get("dt_s") for header in headers)
     settings = settings_of([header.provenance for header in headers], names, options.dt_s, OF_COORDINATES)
     pressed = _pressure(paths, settings, options)
-    found = fitted(_samples(paths, options), settings, options.divergence, names[0])
-    notices = fit_notices(found.summary, options.divergence, paths[0].name)
+    parts = [
+        fields.samples_of_vectors(vtkhdf.open_vectors(path), str(path))
+        if format_of(path) == vtkhdf.VECTORS_FORMAT
+        else fields.samples_of_tracks(read_tracks(path), options.frame)
+        for path in paths
+    ]
+    found = fields.fitted(parts, settings, options.divergence, names[0])
+    notices = fields.fit_notices(found.summary, options.divergence, paths[0].name)
     console.warn(notices)
     inputs = {f"samples_{number:04d}": path for number, path in enumerate(paths)}
     inputs |= {f"particles_{number:04d}": path for number, path in enumerate(options.pressure)}
     chosen = {"divergence": options.divergence, "frame": options.frame, "derived": options.derived}
     made = with_warnings(record("field", settings.resolved() | {"field": chosen}, inputs), notices)
     vectors = found.vectors()
-    extra = _derived(found) if options.derived else {}
+    extra: fields.Extra = {}
+    if options.derived:
+        # What follows from the field's gradients, and these, row by row.
+        gradients = found.gradients()
+        flat = gradients.reshape(*gradients.shape[:3], 9)
+        extra = fields.arrays_of(found.derived())
+        extra |= {f"gradient_{name}": (flat[..., 3 * row : 3 * row + 3], "1/s") for row, name in enumerate("uvw")}
     if pressed is not None:
         extra |= {"pressure": (pressed.pressure_pa, "Pa"), "pressure_sigma": (pressed.pressure_sigma_pa, "Pa")}
     vtkhdf.write_vectors(output, vectors, headers[0].reference, provenance=made, overwrite=overwrite, extra=extra)
@@ -276,27 +268,10 @@ def fit_flow(
         write_text(places, _table(points, found), overwrite)
     figures = {} if pressed is None else pressed.figures
     if options.derived:
-        figures = figures | found.turbulence(_viscosity_m2_s(settings))
-    return found.summary | figures | _figures(vectors)
-
-
-def _viscosity_m2_s(settings: Config) -> float | None:
-    """Return the kinematic viscosity, None where the config does not say it."""
-    media = settings.media
-    if media.fluid_density_kg_m3 is None or media.fluid_viscosity_pa_s is None:
-        return None
-    return media.fluid_viscosity_pa_s / media.fluid_density_kg_m3
-
-
-def _samples(paths: Sequence[Path], options: FieldOptions) -> list[Samples]:
-    """Return the samples of each file."""
-    parts = []
-    for path in paths:
-        if format_of(path) == vtkhdf.VECTORS_FORMAT:
-            parts.append(samples_of_vectors(vtkhdf.open_vectors(path), str(path)))
-        else:
-            parts.append(samples_of_tracks(read_tracks(path), options.frame))
-    return parts
+        density, viscosity = settings.media.fluid_density_kg_m3, settings.media.fluid_viscosity_pa_s
+        kinematic = None if density is None or viscosity is None else viscosity / density
+        figures = figures | found.turbulence(kinematic)
+    return found.summary | figures | _counts(vectors)
 
 
 def _pressure(paths: Sequence[Path], settings: Config, options: FieldOptions) -> PressureResult | None:
@@ -312,16 +287,7 @@ def _pressure(paths: Sequence[Path], settings: Config, options: FieldOptions) ->
         raise InputError(f"{paths[0]} with {options.pressure[0].parent}: {error}") from error
 
 
-def _derived(found: FittedField) -> Extra:
-    """Return what follows from the field's gradients, and these, row by row."""
-    gradients = found.gradients()
-    flat = gradients.reshape(*gradients.shape[:3], 9)
-    return arrays_of(found.derived()) | {
-        f"gradient_{name}": (flat[..., 3 * row : 3 * row + 3], "1/s") for row, name in enumerate("uvw")
-    }
-
-
-def _figures(vectors: VectorField) -> dict[str, Any]:
+def _counts(vectors: VectorField) -> dict[str, Any]:
     """Return how many vectors there are, and how well they are known."""
     kept, sigma = vectors.flag < REJECTED, vectors.uncertainty_voxel
     known = sigma is not None and kept.any()
@@ -333,7 +299,7 @@ def _figures(vectors: VectorField) -> dict[str, Any]:
     }
 
 
-def read_places(path: Path) -> NDArray[np.float64]:
+def read_places(path: Path) -> Floats:
     """Read points (n, 3), mm: x, y, z in a line, by commas; lines that begin with a letter or # are passed over.
 
     Raises
@@ -356,7 +322,7 @@ def read_places(path: Path) -> NDArray[np.float64]:
     return np.array(rows)
 
 
-def _table(points: NDArray[np.float64], found: FittedField) -> str:
+def _table(points: Floats, found: fields.FittedField) -> str:
     """Return velocities and standard deviations at points as text."""
     rows = np.concatenate([points, found.at(points), found.sigma(points)], axis=1)
     lines = [",".join(repr(float(value)) for value in row) for row in rows]

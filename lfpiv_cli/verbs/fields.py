@@ -1,27 +1,46 @@
-"""Velocity fields fitted to tracks and vectors in memory."""
+"""Velocity fields fitted to tracks and vectors in memory; means of fields that are there, and what follows from one."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Floats
+from lfpiv_cli.console import Console, Frames
 from lfpiv_cli.errors import InputError, UsageError
 from lfpiv_cli.fields import fit, turbulence
 from lfpiv_cli.fields.samples import Samples, joined
 from lfpiv_cli.fields.spline_field import SplineField, gradient_covariance_at
-from lfpiv_cli.files.config import Config
-from lfpiv_cli.files.particle_file import Points, matrices
+from lfpiv_cli.files import vtkhdf
+from lfpiv_cli.files.batch import Target
+from lfpiv_cli.files.config import Config, carried_config
+from lfpiv_cli.files.hdf5 import format_of
+from lfpiv_cli.files.particle_file import TRACKS_FORMAT, TRAJECTORIES_FORMAT, Points, matrices, read_tracks
+from lfpiv_cli.files.provenance import OF_COORDINATES, ensure_agreement, record
 from lfpiv_cli.flow.correlation import SMALLEST_VALID_FRACTION
-from lfpiv_cli.flow.field import MASKED, MM_TO_M, REJECTED, VALID, Derived, VectorField, derived_from
-from lfpiv_cli.flow.from_tracks import Paths, WindowGrid, without_tracks
+from lfpiv_cli.flow.field import (
+    MASKED,
+    MM_TO_M,
+    REJECTED,
+    VALID,
+    Derived,
+    VectorField,
+    derived_fields,
+    derived_from,
+    statistics_of,
+)
+from lfpiv_cli.flow.from_tracks import Paths, WindowGrid, vectors_from_paths, without_tracks
 from lfpiv_cli.flow.windows import ParallelWalls
 from lfpiv_cli.names import Divergence
 from lfpiv_cli.notice import Notice
-from lfpiv_cli.verbs.tracks import Tracked, TracksOf
+from lfpiv_cli.verbs.batches import Batch, BatchOptions, work_through
+from lfpiv_cli.verbs.checks import quality_of
+from lfpiv_cli.verbs.tracks import Tracked, TracksOf, windows_of
 
 # Fewer samples do not tell a field of three components that varies along three axes.
 FEWEST_SAMPLES = 20
@@ -50,19 +69,19 @@ class FittedField:
 
     field: fit.Field
     windows: WindowGrid
-    middles_mm: NDArray[np.float64]
+    middles_mm: Floats
     dt_s: float
     summary: dict[str, Any]
 
-    def at(self, points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+    def at(self, points_mm: Floats) -> Floats:
         """Return velocities (m, 3) at points, m/s."""
         return self.field.value_at(points_mm) * (MM_TO_M / self.dt_s)
 
-    def sigma(self, points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+    def sigma(self, points_mm: Floats) -> Floats:
         """Return the velocities' standard deviations (m, 3), m/s."""
         return np.asarray(np.sqrt(self.field.variance_at(points_mm)) * (MM_TO_M / self.dt_s))
 
-    def gradient(self, points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+    def gradient(self, points_mm: Floats) -> Floats:
         """Return the velocities' gradients (m, 3, 3), 1/s: the component, then the direction."""
         return self.field.gradient_at(points_mm) / self.dt_s
 
@@ -70,7 +89,7 @@ class FittedField:
         """Return what follows from the field's own gradients at the windows' centres."""
         return derived_from(self.gradients())
 
-    def gradients(self) -> NDArray[np.float64]:
+    def gradients(self) -> Floats:
         """Return the gradients (nz, ny, nx, 3, 3) at the windows' centres, 1/s; NaN where there is no vector."""
         grid = self.windows.centres
         gradient = self.gradient(grid.centres_mm().reshape(-1, 3)).reshape(*grid.shape_zyx, 3, 3)
@@ -171,20 +190,15 @@ def fit_field(
     settings = rig or next((each.settings for each in given if isinstance(each, Tracked)), None)
     if settings is None:
         raise InputError("vectors alone do not tell the grid: give the rig")
-    _ensure_one_flow(given, settings.correlation.dt_s)
+    times = (each.settings.correlation.dt_s if isinstance(each, Tracked) else each.dt_s for each in given)
+    ensure_one_time([*times, settings.correlation.dt_s])
+    if len({each.points.reference for each in given if isinstance(each, Tracked)}) > 1:
+        raise InputError("the tracks' coordinates have different origins")
     parts = [
         samples_of_tracks(each.points) if isinstance(each, Tracked) else samples_of_vectors(each, "vectors")
         for each in given
     ]
     return fitted(parts, settings, divergence, "field")
-
-
-def _ensure_one_flow(given: Sequence[Tracked | VectorField], dt_s: float | None) -> None:
-    """Raise InputError where steps in time or origins of places differ."""
-    times = (each.settings.correlation.dt_s if isinstance(each, Tracked) else each.dt_s for each in given)
-    ensure_one_time([*times, dt_s])
-    if len({each.points.reference for each in given if isinstance(each, Tracked)}) > 1:
-        raise InputError("the tracks' coordinates have different origins")
 
 
 def ensure_one_time(times_s: Iterable[float | None]) -> None:
@@ -225,7 +239,17 @@ def samples_of_tracks(points: Points, frame: int | None = None) -> Samples:
     """
     arrays = points.arrays
     if "frame" in arrays:
-        return _samples_in(points, frame)
+        last = int(arrays["frame"].max(initial=-1))
+        number = (last + 1) // 2 if frame is None else frame
+        if not 0 <= number <= last:
+            raise UsageError(f"frame {number} is none of {last + 1}, which are counted from 0")
+        # Places and velocities of fits in time.
+        here, to_mm = arrays["frame"] == number, float(points.attributes["dt_s"]) / MM_TO_M
+        sigma_mm = to_mm * arrays["velocity_sigma"][here]
+        covariance = sigma_mm[:, :, np.newaxis] ** 2 * np.eye(3)
+        probability = np.nan_to_num(arrays["link_probability"][here], nan=1.0)
+        value_mm = to_mm * arrays["velocity"][here]
+        return Samples(points.position_mm[here], value_mm, covariance, probability, place_share=0.0)
     if frame is not None:
         raise UsageError("a frame is of a sequence, and these are tracks of a pair")
     displacement = arrays["displacement_mm"]
@@ -236,35 +260,6 @@ def samples_of_tracks(points: Points, frame: int | None = None) -> Samples:
         covariance = sigma_mm[:, :, np.newaxis] ** 2 * np.eye(3)
     probability = np.nan_to_num(arrays["link_probability"], nan=1.0)
     return Samples(points.position_mm, displacement, covariance, probability)
-
-
-def paths_of(tracks: Points) -> list[Paths]:
-    """Return the tracks of a pair, or those in each frame of a sequence, as paths from one frame to the next."""
-    frames = range(int(tracks.arrays["frame"].max(initial=-1)) + 1) if "frame" in tracks.arrays else [None]
-    every = [samples_of_tracks(tracks, frame) for frame in frames]
-    return [
-        Paths(each.points_mm, each.value_mm, np.sqrt(np.diagonal(each.covariance_mm2, axis1=1, axis2=2)))
-        for each in every
-    ]
-
-
-def _samples_in(points: Points, frame: int | None) -> Samples:
-    """Return a sequence's tracks in a frame as samples: places and velocities of fits in time."""
-    arrays = points.arrays
-    last = int(arrays["frame"].max(initial=-1))
-    number = (last + 1) // 2 if frame is None else frame
-    if not 0 <= number <= last:
-        raise UsageError(f"frame {number} is none of {last + 1}, which are counted from 0")
-    here = arrays["frame"] == number
-    to_mm = float(points.attributes["dt_s"]) / MM_TO_M
-    sigma_mm = to_mm * arrays["velocity_sigma"][here]
-    return Samples(
-        points.position_mm[here],
-        to_mm * arrays["velocity"][here],
-        sigma_mm[:, :, np.newaxis] ** 2 * np.eye(3),
-        np.nan_to_num(arrays["link_probability"][here], nan=1.0),
-        place_share=0.0,
-    )
 
 
 def samples_of_vectors(field: VectorField, name: str) -> Samples:
@@ -286,14 +281,8 @@ def samples_of_vectors(field: VectorField, name: str) -> Samples:
     voxel = np.asarray(field.voxel_mm)
     shared = float(np.prod(voxel * field.window_voxel / field.grid.spacing_mm))
     variance = shared * (field.uncertainty_voxel[known] * voxel) ** 2
-    points = field.grid.centres_mm()[known]
-    return Samples(
-        points,
-        field.displacement_voxel[known] * voxel,
-        variance[:, :, np.newaxis] * np.eye(3),
-        np.ones(len(points)),
-        0.0,
-    )
+    points, covariance = field.grid.centres_mm()[known], variance[:, :, np.newaxis] * np.eye(3)
+    return Samples(points, field.displacement_voxel[known] * voxel, covariance, np.ones(len(points)), 0.0)
 
 
 def fitted(parts: Sequence[Samples], settings: Config, divergence: Divergence, name: str) -> FittedField:
@@ -310,15 +299,9 @@ def fitted(parts: Sequence[Samples], settings: Config, divergence: Divergence, n
         raise InputError(f"{name}: its config has no correlation.dt_s; give --dt-s")
     if len(samples) < FEWEST_SAMPLES:
         raise InputError(f"{name}: {len(samples)} samples, expected at least {FEWEST_SAMPLES}")
-    volume = settings.grid()
     still = settings.still_walls()
-    windows = WindowGrid(
-        volume,
-        settings.windows_voxel(volume.spacing_mm)[-1],
-        settings.overlap(volume.spacing_mm),
-        still or settings.masking_walls(),
-    )
-    low, high = np.array([volume.bounds_mm(axis) for axis in range(3)]).T
+    windows = windows_of(settings, still or settings.masking_walls())
+    low, high = np.array([windows.volume.bounds_mm(axis) for axis in range(3)]).T
     if isinstance(still, ParallelWalls) and settings.volume.reference != "mid_plane":
         raise InputError(f"{name}: channel.no_slip needs volume.reference mid_plane, found {settings.volume.reference}")
     points = fit.NO_POINTS if still is None else still.points(low, high, WALL_STEP * windows.sides_mm)
@@ -356,3 +339,99 @@ def fit_notices(summary: Mapping[str, Any], divergence: Divergence, name: str) -
         remedy = "look at where they are: wrong links, or a flow that changes within the distance of the knots"
         notices.append(Notice("samples-left-out", name, text, remedy, belonging, f"at least {LEAST_BELONGING:g}"))
     return notices
+
+
+Extra = dict[str, tuple[NDArray[Any], str]]
+
+
+def arrays_of(derived: Derived) -> Extra:
+    """Return derived fields with the names and units that files give them."""
+    return {
+        "vorticity": (derived.vorticity, "1/s"),
+        "divergence": (derived.divergence, "1/s"),
+        "strain_rate": (derived.strain_rate, "1/s"),
+        "q_criterion": (derived.q_criterion, "1/s2"),
+    }
+
+
+class Mean(Batch[None]):
+    """The mean of a batch's vectors, with their fluctuations as `velocity_rms` and `displacement_rms_voxel`."""
+
+    label, unit = "mean", "file"
+
+    def __init__(
+        self, path: Path, fields: Sequence[Path], resolved: Mapping[str, Any], derived: bool, overwrite: bool
+    ) -> None:
+        """Take where it goes, the files of vectors, and their settings."""
+        self.inputs, self._resolved, self._derived, self.overwrite = fields, resolved, derived, overwrite
+        self.targets = [Target(path, self._record)]
+
+    def make(self, number: int, _work: Frames) -> None:
+        """Write it."""
+        found = statistics_of(field for path in self.inputs for field in _fields_in(path))
+        extra: Extra = {"displacement_rms_voxel": (found.rms_voxel, "voxel"), "samples": (found.samples, "1")}
+        if found.mean.dt_s is not None:
+            to_velocity = np.asarray(found.mean.voxel_mm) * MM_TO_M / found.mean.dt_s
+            extra["velocity_rms"] = (found.rms_voxel * to_velocity, "m/s")
+        if self._derived:
+            extra |= arrays_of(derived_fields(found.mean))
+        target, reference = self.targets[number], vtkhdf.read_header(self.inputs[0]).reference
+        vtkhdf.write_vectors(target.path, found.mean, reference, provenance=target.record, overwrite=True, extra=extra)
+
+    def _record(self) -> dict[str, Any]:
+        inputs = {f"vectors_{number:04d}": field for number, field in enumerate(self.inputs)}
+        return record("correlate mean", self._resolved, inputs)
+
+
+def are_measured(files: Sequence[Path]) -> bool:
+    """Return whether files are vectors or tracks, by the first that can be read: no volumes."""
+    for path in files:
+        try:
+            return format_of(path) in (vtkhdf.VECTORS_FORMAT, TRACKS_FORMAT, TRAJECTORIES_FORMAT)
+        except InputError:
+            continue
+    return False
+
+
+def mean_of_measured(
+    files: Sequence[Path], mean: Path, options: BatchOptions, derived: bool, overwrite: bool, console: Console
+) -> dict[str, Any]:
+    """Write the mean of vectors and tracks that are there; return what is told of it.
+
+    Raises
+    ------
+    InputError : they were not made alike
+    """
+    # Tracks whose vectors on a grid (`track --grid`) are among the files are left out.
+    gridded = {path.parent / path.stem.rpartition("_grid")[0] for path in files}
+    files = [path for path in files if path.with_suffix("") not in gridded or format_of(path) == vtkhdf.VECTORS_FORMAT]
+    headers = [vtkhdf.read_header(path) for path in files]
+    for header, path in zip(headers, files, strict=True):
+        if header.reference != headers[0].reference:
+            raise InputError(f"{path}: its coordinates have another origin than those of {files[0]}")
+        command, first = header.provenance.get("command"), headers[0].provenance.get("command")
+        if command != first:
+            raise InputError(f"{path}: was made by {command}, but {files[0]} by {first}; a mean is of one kind")
+    records = [header.provenance for header in headers]
+    ensure_agreement(records, [str(path) for path in files], OF_COORDINATES)
+    batch = Mean(mean, files, records[0].get("config") or {}, derived, overwrite)
+    worked = work_through(batch, options, console)
+    found = vtkhdf.open_vectors(mean)
+    told = {"files": len(files), "skipped": worked.skipped, "vectors": found.flag.size}
+    return told | {"rejected": int(np.count_nonzero(found.flag >= REJECTED))} | quality_of(found).summary()
+
+
+def _fields_in(path: Path) -> Iterator[VectorField]:
+    """Yield the vectors in a file, of tracks those on the grid of the interrogation windows, a field a frame."""
+    if format_of(path) == vtkhdf.VECTORS_FORMAT:
+        yield vtkhdf.open_vectors(path)
+        return
+    tracks = read_tracks(path)
+    settings = carried_config(tracks.provenance, path)
+    windows = windows_of(settings, settings.masking_walls())
+    frames: Iterable[int | None] = [None]
+    if "frame" in tracks.arrays:
+        frames = range(int(tracks.arrays["frame"].max(initial=-1)) + 1)
+    for each in [samples_of_tracks(tracks, frame) for frame in frames]:
+        sigma_mm = np.sqrt(np.diagonal(each.covariance_mm2, axis1=1, axis2=2))
+        yield vectors_from_paths(Paths(each.points_mm, each.value_mm, sigma_mm), windows, settings.correlation.dt_s)

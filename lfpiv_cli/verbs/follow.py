@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
@@ -31,38 +31,30 @@ from lfpiv_cli.files.batch import (
 )
 from lfpiv_cli.files.config import Config, carried_config
 from lfpiv_cli.files.exports.vtk import write_playback
-from lfpiv_cli.files.inputs import given
 from lfpiv_cli.files.pairing import in_order
 from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, Points, no_points, read_points, write_points
 from lfpiv_cli.files.provenance import even_step_s, record, sha256, with_warnings
 from lfpiv_cli.files.shares import Deadline
 from lfpiv_cli.notice import Notice
+from lfpiv_cli.particles.neighbour_frames import STEPS as PREDICTED_STEPS
 from lfpiv_cli.reconstruction.images import Image
 from lfpiv_cli.reference import Reference
 from lfpiv_cli.tracks.candidates import Trajectories
 from lfpiv_cli.verbs import particles
 from lfpiv_cli.verbs.batches import ALL, Batch, Failure, Worked, WorkOptions, dry_run
 from lfpiv_cli.verbs.checks import few_notices
-from lfpiv_cli.verbs.following import (
-    SHORTEST,
-    Recorded,
-    ensure_sequence,
-    forwards,
-    go_both_ways,
-    steps_of,
-)
+from lfpiv_cli.verbs.following import SHORTEST, Recorded, ensure_sequence, forwards, go_both_ways
 from lfpiv_cli.verbs.frames import (
-    STILL,
-    Background,
+    ImageOptions,
     bench_of,
     check_frame,
     frame_notices,
     frames_dt_notices,
     mask_of,
+    other_frames,
     read_frame,
     reader,
     residual_path,
-    sequence_digests,
 )
 from lfpiv_cli.verbs.particles import open_weights_that_fit, searchable_weights
 from lfpiv_cli.verbs.reconstruct import file_notices
@@ -70,52 +62,47 @@ from lfpiv_cli.verbs.tracers import size_notices
 from lfpiv_cli.verbs.track import SeenFrames, stored_tracks
 from lfpiv_cli.verbs.tracks import Tracking, tracking_of
 
-# The files of a sequence's frames, as they are followed: one for each, written as it is found.
 
-
+@dataclass(eq=False)
 class PlannedFrames(Batch[None]):
     """The frames of a sequence that can be read before any is followed, as `dry_run` asks of them."""
 
-    label, unit = "follow", "frame"
-
-    def __init__(
-        self,
-        targets: Sequence[Target],
-        beside: Sequence[Path],
-        inputs: Sequence[Path],
-        left_out: Sequence[Failure],
-        overwrite: bool,
-    ) -> None:
-        """Take where particles and the other files go, what is read, and which frames cannot be."""
-        self.targets, self.beside, self.inputs = targets, beside, inputs
-        self.left_out, self.overwrite = left_out, overwrite
+    targets: Sequence[Target]
+    inputs: Sequence[Path]
+    overwrite: bool
+    beside: Sequence[Path]
+    left_out: Sequence[Failure]
+    label = "follow"
+    unit = "frame"
 
 
+@dataclass(eq=False)
 class FrameFiles:
-    """A store of one file for each frame."""
+    """A store of one file for each frame, written as it is found.
 
-    def __init__(
-        self,
-        targets: Sequence[Target],
-        needed: frozenset[int],
-        there: frozenset[int],
-        reference: Reference,
-        said: Sequence[Notice],
-        residuals: bool,
-        overwrite: bool,
-        work: Frames,
-        deadline: Deadline,
-    ) -> None:
-        """Take where the frames' files go, which are to be made, which there are, and what is said of all of them."""
-        self._deadline, self._begun, self._put = deadline, time.monotonic(), 0
-        self.targets, self.needed, self.there, self.said = targets, needed, there, said
-        self._nothing = no_points(PARTICLES_FORMAT, reference)
-        self.residuals, self.overwrite, self.work = residuals, overwrite, work
+    Attributes
+    ----------
+    targets : where the frames' files go
+    needed, there : the numbers of those that are to be made, and of all that there are
+    said : what is said of all of them
+    """
+
+    targets: Sequence[Target]
+    needed: Collection[int]
+    there: Collection[int]
+    reference: Reference
+    said: Sequence[Notice]
+    residuals: bool
+    overwrite: bool
+    work: Frames
+    deadline: Deadline
+    put_so_far: int = 0
+    begun_s: float = 0.0
 
     def read(self, number: int) -> Points:
         """Return the particles of a frame; none of one that was left out."""
         if number not in self.there:
-            return self._nothing
+            return no_points(PARTICLES_FORMAT, self.reference)
         return read_points(self.targets[number].path, PARTICLES_FORMAT)
 
     def made(self, number: int) -> Points | None:
@@ -127,10 +114,10 @@ class FrameFiles:
         """
         if number not in self.needed:
             return self.read(number)
-        if not self._deadline.leaves_time():
-            done = len(self.there) - len(self.needed) + self._put
-            raise self._deadline.error(done, len(self.there), "frame")
-        self._begun = time.monotonic()
+        if not self.deadline.leaves_time():
+            done = len(self.there) - len(self.needed) + self.put_so_far
+            raise self.deadline.error(done, len(self.there), "frame")
+        self.begun_s = time.monotonic()
         return None
 
     def put(self, number: int, points: Points, left: Image, notices: list[Notice]) -> None:
@@ -141,8 +128,8 @@ class FrameFiles:
             image_files.write_tiff(residual_path(target.path), left, overwrite=True)
         told = replace(points, provenance=with_warnings(target.record, [*self.said, *notices]))
         write_points(target.path, PARTICLES_FORMAT, told, overwrite=self.overwrite)
-        self._deadline.took(time.monotonic() - self._begun)
-        self._put += 1
+        self.deadline.took(time.monotonic() - self.begun_s)
+        self.put_so_far += 1
         self.work.done(target.path.stem)
 
 
@@ -152,12 +139,11 @@ TRACKS, PLAYBACK = f"tracks{VTKHDF_SUFFIX}", f"playback{VTKHDF_SUFFIX}"
 
 
 @dataclass(frozen=True, kw_only=True)
-class FollowOptions(WorkOptions):
+class FollowOptions(ImageOptions, WorkOptions):
     """What `follow_particles` is given besides weights and images; with `keep_going` tracks end before bad frames.
 
     Attributes
     ----------
-    dark, background, mask : as of `reconstruct`
     dt_s : time from one frame to the next, in place of the config's
     search_voxel : displacements from the first frame to the second are sought up to this along each axis
     shortest : fewest frames of a track
@@ -165,9 +151,6 @@ class FollowOptions(WorkOptions):
     residuals : write what the particles leave of each image, too
     """
 
-    dark: Path | None = None
-    background: str | None = None
-    mask: str | Path | None = None
     dt_s: float | None = None
     search_voxel: float | None = None
     shortest: int = SHORTEST
@@ -204,9 +187,7 @@ def follow_particles(
     order, notices = in_order(images_seen(frames))
     frames = [frames[number] for number in order]
     console.warn(notices)
-    level = Background.parse(options.background)
-    mask_file = None if options.mask is None or options.mask == STILL else Path(options.mask)
-    common = given(weights=weights, dark=options.dark, background=level.path, mask=mask_file)
+    level, common = options.level, options.files(weights)
     content = open_weights_that_fit(weights)
     settings = carried_config(content.provenance, weights).overridden("reconstruction", solver="particles")
     settings = settings.overridden("correlation", dt_s=options.dt_s)
@@ -222,19 +203,24 @@ def follow_particles(
         frames, left_out = _readable(frames, shape)
         console.warn(Notice("frame-failed", each.name, each.error, "leave it out, or mend it") for each in left_out)
         ensure_sequence(len(frames), options.shortest)
-    told = sequence_digests(level, frames, options.mask)
-    passes = _passes(output, frames, told, settings, tracking, common, options.both_ways)
+    words = other_frames(level, frames, options.mask)
+    passes = _passes(output, frames, words, settings, tracking, common, options.both_ways)
     inputs = [*common.values(), *images]
     if options.dry_run:
         beside = [output / TRACKS, output / PLAYBACK, *(target.path for targets in passes[:-1] for target in targets)]
         here = [target for target, frame in zip(passes[-1], frames, strict=True) if frame.fault is None]
-        return dry_run(PlannedFrames(here, beside, inputs, left_out, overwrite), options, console)
+        return dry_run(PlannedFrames(here, inputs, overwrite, beside, left_out), options, console)
     content = searchable_weights(weights, content, settings)
     there = [number for number, frame in enumerate(frames) if frame.fault is None]
-    needed = [_needed(targets, there, inputs, options, overwrite, targets is passes[-1]) for targets in passes]
+    # It is known that what is to be made can be written.
+    replacing, needed = overwrite or options.resume, []
+    for targets in passes:
+        needed.append([there[k] for k in pending([targets[k] for k in there], inputs, overwrite, options.resume)])
+        for number in needed[-1] if options.residuals and targets is passes[-1] else []:
+            ensure_writable(residual_path(targets[number].path), replacing, inputs)
     for name in (TRACKS, PLAYBACK):
-        ensure_writable(output / name, overwrite or options.resume, inputs)
-    dark = image_files.read_reference(options.dark, shape) if options.dark else None
+        ensure_writable(output / name, replacing, inputs)
+    dark = options.dark_image(shape)
     pitch_px = float(content.camera.micro_image_lattice_px().pitch.max())
     bench = bench_of(content, settings, dark, mask_of(options.mask, frames, shape, pitch_px, options.keep_going))
     read = reader(level, frames, shape, dark, options.keep_going)
@@ -251,12 +237,14 @@ def follow_particles(
     sequence = Recorded(bench, size, tracking, frame_at, [frame.stem for frame in frames], {})
     found: Trajectories | None
     count, deadline = sum(map(len, needed)), options.deadline()
-    with console.frames(count, steps_of(needed) / max(count, 1), "follow") as work:
+    searched = sum(number < 2 for number in needed[0])
+    steps = searched * particles.STEPS + (count - searched) * PREDICTED_STEPS
+    with console.frames(count, steps / max(count, 1), "follow") as work:
         stores = [
             FrameFiles(
                 targets,
-                frozenset(numbers),
-                frozenset(there),
+                set(numbers),
+                set(there),
                 content.reference,
                 said,
                 options.residuals and targets is passes[-1],
@@ -271,7 +259,7 @@ def follow_particles(
             go_both_ways(sequence, found, stores[0].read, stores[1], work.advance)
             found = None
     counts = {"frames": len(frames), "found": len(needed[-1]), "skipped": len(there) - len(needed[-1])}
-    summary = _write_tracks(output, sequence, stores[-1], found, overwrite or options.resume, console)
+    summary = _write_tracks(output, sequence, stores[-1], found, replacing, console)
     worked = Worked(dict.fromkeys(there), failures=left_out)
     worked.list_failures(options.failures)
     return worked.ensure_whole(counts | summary | size.summary(), "frame")
@@ -282,36 +270,21 @@ def _readable(frames: Sequence[Frame], shape: tuple[int, int]) -> tuple[list[Fra
 
     It begins with two that can be read, as these are found together.
     """
-    seen = [replace(frame, fault=_fault(frame, shape)) for frame in frames]
+    seen: list[Frame] = []
+    for frame in frames:
+        try:
+            raw, fault = read_frame(frame, shape), None
+        except InputError as error:
+            fault = str(error)
+        else:
+            if raw.min() == raw.max():
+                fault = f"{frame.path}: has one value everywhere; it shows no particles"
+        seen.append(replace(frame, fault=fault))
     begins = (k for k in range(len(seen) - 1) if seen[k].fault is None and seen[k + 1].fault is None)
     begin = next(begins, len(seen))
     before = "is before the first two frames in a row that can be read"
     left_out = [frame for k, frame in enumerate(seen) if k < begin or frame.fault is not None]
     return seen[begin:], [Failure(frame.stem, frame.fault or f"{frame.path}: {before}") for frame in left_out]
-
-
-def _fault(frame: Frame, shape: tuple[int, int]) -> str | None:
-    """Return why a frame cannot be followed; None where it can."""
-    try:
-        raw = read_frame(frame, shape)
-    except InputError as error:
-        return str(error)
-    return f"{frame.path}: has one value everywhere; it shows no particles" if raw.min() == raw.max() else None
-
-
-def _needed(
-    targets: Sequence[Target],
-    there: Sequence[int],
-    inputs: Sequence[Path],
-    options: FollowOptions,
-    overwrite: bool,
-    last: bool,
-) -> list[int]:
-    """Return which of the frames that are there have to be made, after it is known that they can be written."""
-    needed = [there[k] for k in pending([targets[k] for k in there], inputs, overwrite, options.resume)]
-    for number in needed if options.residuals and last else []:
-        ensure_writable(residual_path(targets[number].path), overwrite or options.resume, inputs)
-    return needed
 
 
 def _write_tracks(
@@ -337,7 +310,7 @@ def _write_tracks(
 def _passes(
     output: Path,
     frames: Sequence[Frame],
-    told: Sequence[str],
+    words: Callable[[int], str],
     settings: Config,
     tracking: Tracking,
     common: Mapping[str, Path],
@@ -346,7 +319,7 @@ def _passes(
     """Return for each pass where the files of its frames go, and the records that they carry.
 
     These say which frames each is made with: on the way forwards those before it (the first with the second), the
-    second time all; `told` says what their background and mask are made of.
+    second time all; `words` says what their background and mask are made of.
     """
     every = ["left out\n" if frame.fault else f"{sha256(frame.path)} {frame.page}\n" for frame in frames]
     resolved = settings.resolved()
@@ -357,7 +330,7 @@ def _passes(
             f"follow {way} page {frame.page} of {count} frames, SHA-256 {digest}, within {tracking.search_mm:g} mm"
         )
         inputs, taken_s = {**common, "image": frame.path}, {"image": frame.time_s}
-        return Target(path, partial(record, command + told[number], resolved, inputs, taken_s))
+        return Target(path, partial(record, command + words(number), resolved, inputs, taken_s))
 
     stems, numbers = [frame.stem for frame in frames], range(len(frames))
     folder = output / (FORWARDS if both_ways else PARTICLES)

@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.errors import UsageError
 from lfpiv_cli.files.config import carried_config
 from lfpiv_cli.files.particle_file import Points
 from lfpiv_cli.files.provenance import record
 from lfpiv_cli.files.weights_file import WeightsFile
 from lfpiv_cli.notice import Notice, warn_of
-from lfpiv_cli.particles.neighbour_frames import STEPS as PREDICTED_STEPS
 from lfpiv_cli.particles.neighbour_frames import Predicted, find_predicted
 from lfpiv_cli.particles.rounds import first_pass
 from lfpiv_cli.particles.search import Particles, blank, rebuilt, result
@@ -25,7 +25,6 @@ from lfpiv_cli.tracks.sequences import PAST_FRAMES, REACH_FRAMES, Ahead, SoFar, 
 from lfpiv_cli.verbs.checks import few_notices
 from lfpiv_cli.verbs.frames import Bench, Progress, bench_of, check_frame, frame_notices, given_picture, picture_for
 from lfpiv_cli.verbs.particles import (
-    STEPS,
     Frame,
     find_beside,
     find_first,
@@ -139,12 +138,6 @@ def follow(
     return Followed(particles, tracks)
 
 
-def steps_of(passes: Sequence[Collection[int]]) -> int:
-    """Return the units of progress of frames with these numbers on the way forwards, and of those of a second pass."""
-    searched = sum(number < 2 for number in passes[0])
-    return searched * STEPS + (sum(map(len, passes)) - searched) * PREDICTED_STEPS
-
-
 class Store(Protocol):
     """Where the particles of frames are put as they are found."""
 
@@ -155,13 +148,12 @@ class Store(Protocol):
         """Take the particles of a frame, what they leave of its image, and what is said of it."""
 
 
+@dataclass(eq=False)
 class Memory:
     """A store that forgets what is left of images."""
 
-    def __init__(self) -> None:
-        """Begin with nothing."""
-        self.particles: dict[int, Points] = {}
-        self.notices: list[Notice] = []
+    particles: dict[int, Points] = field(default_factory=dict)
+    notices: list[Notice] = field(default_factory=list)
 
     def made(self, number: int) -> Points | None:
         """Return the particles of a frame that were put here."""
@@ -174,12 +166,7 @@ class Memory:
 
 
 def ensure_sequence(frames: int, shortest: int) -> None:
-    """Refuse what is no sequence, or one that is shorter than its tracks must be.
-
-    Raises
-    ------
-    UsageError
-    """
+    """Refuse with UsageError what is no sequence, or one that is shorter than its tracks must be."""
     if frames < FEWEST_FRAMES:
         raise UsageError(
             f"follow needs {FEWEST_FRAMES} frames at least, got {frames}; for a pair: reconstruct --solver particles "
@@ -216,6 +203,7 @@ def forwards(sequence: Recorded, store: Store, progress: Progress | None = None)
 
     The first two frames help each other. Only the last few frames are held in memory.
     """
+    bench, tracking = sequence.bench, sequence.tracking
     recent: dict[int, Seen] = {}
     so_far: SoFar | None = None
     first_two: list[Particles] = []
@@ -225,12 +213,20 @@ def forwards(sequence: Recorded, store: Store, progress: Progress | None = None)
             frame = sequence.frame(number)
             notices: list[Notice] = []
             if so_far is None or number < 2:
-                first_two = first_two or _first_two(sequence, progress)
+                if not first_two:
+                    two = [sequence.frame(k) for k in range(2)]
+                    own = [find_first(bench, each, progress) for each in two]
+                    first_two = [find_beside(bench, two[k], own[k], [own[1 - k]]) for k in range(2)]
                 found = first_two[number]
             else:
                 found, notices = _next(sequence, number, frame, so_far.ahead, progress)
             points = _put(sequence, store, number, frame, found, notices)
-        so_far = _linked_to(so_far, recent, number, points, sequence.tracking)
+        recent[number] = seen_in(points)
+        recent.pop(number - LOOKED_BACK, None)
+        if so_far is None:
+            so_far = begun(recent)
+        else:
+            so_far = followed_further(so_far, recent, tracking.search_mm, tracking.scale)
     if so_far is None:
         raise ValueError("a sequence has frames")
     return so_far.found
@@ -269,22 +265,21 @@ def go_both_ways(
             _put(sequence, store, number, frame, particles, notices)
         else:
             points = forward(number)
-            store.put(number, points, _left_by(sequence.bench, frame, points), [])
-
-
-def _first_two(sequence: Recorded, progress: Progress | None) -> list[Particles]:
-    """Return the particles of the first two frames, found with each other's help."""
-    frames = [sequence.frame(number) for number in range(2)]
-    own = [find_first(sequence.bench, frame, progress) for frame in frames]
-    return [find_beside(sequence.bench, frames[k], own[k], [own[1 - k]]) for k in range(2)]
+            task = task_for(sequence.bench, frame)
+            rows = _rows(sequence.bench, points.position_mm, points.arrays["intensity"])
+            residual = rebuilt(task, blank(task), rows).residual.reshape(frame.image.shape)
+            store.put(number, points, np.where(frame.unusable, 0.0, residual).astype(np.float32), [])
 
 
 def _next(
     sequence: Recorded, number: int, frame: Frame, ahead: Ahead, progress: Progress | None
 ) -> tuple[Particles, list[Notice]]:
     """Return the particles of a frame where they are ahead of those before it, and of the rest; what is said of it."""
-    task = task_for(sequence.bench, frame)
-    state = find_predicted(task, _predicted(sequence.bench, ahead), progress)
+    bench, task = sequence.bench, task_for(sequence.bench, frame)
+    known = np.isfinite(ahead.sigma_mm).all(axis=1)
+    sigma = np.abs(bench.content.camera.to_image_axes(ahead.sigma_mm[known]))
+    rows = _rows(bench, ahead.position_mm[known], ahead.light[known])
+    state = find_predicted(task, Predicted(rows, sigma, ahead.light_sigma), progress)
     if state is not None:
         return result(task, state), []
     text = "hardly any particle is where those of the frames before let expect it: it was searched from nothing"
@@ -292,22 +287,7 @@ def _next(
     return result(task, first_pass(task)), [Notice("frame-apart", name, text, remedy, None, "a sequence")]
 
 
-def _left_by(bench: Bench, frame: Frame, points: Points) -> Image:
-    """Return what the particles of a file leave of a frame (rows, columns)."""
-    task, rows = task_for(bench, frame), _rows(bench, points.position_mm, points.arrays["intensity"])
-    residual = rebuilt(task, blank(task), rows).residual.reshape(frame.image.shape)
-    return np.where(frame.unusable, 0.0, residual).astype(np.float32)
-
-
-def _predicted(bench: Bench, ahead: Ahead) -> Predicted:
-    """Return what is ahead, as far as anything tells it, in the axes of images."""
-    known = np.isfinite(ahead.sigma_mm).all(axis=1)
-    sigma = np.abs(bench.content.camera.to_image_axes(ahead.sigma_mm[known]))
-    rows = _rows(bench, ahead.position_mm[known], ahead.light[known])
-    return Predicted(rows, sigma, ahead.light_sigma)
-
-
-def _rows(bench: Bench, position_mm: NDArray[np.float64], light_counts: NDArray[np.float64]) -> NDArray[np.float64]:
+def _rows(bench: Bench, position_mm: Floats, light_counts: Floats) -> Floats:
     """Return particles in the coordinates of files as rows (n, 4) in image axes."""
     from_focal_point = bench.content.reference.points_to_focal_point(position_mm)
     return np.column_stack([bench.content.camera.to_image_axes(from_focal_point), light_counts])
@@ -321,12 +301,3 @@ def _put(
     notices = [*notices, *light_notices(points, sequence.names[number])]
     store.put(number, points, np.asarray(what_is_left(frame, found), np.float32), notices)
     return points
-
-
-def _linked_to(so_far: SoFar | None, recent: dict[int, Seen], number: int, points: Points, tracking: Tracking) -> SoFar:
-    """Return how far it is with one more frame, which is put among the recent ones; the oldest of these goes."""
-    recent[number] = seen_in(points)
-    recent.pop(number - LOOKED_BACK, None)
-    if so_far is None:
-        return begun(recent)
-    return followed_further(so_far, recent, tracking.search_mm, tracking.scale)

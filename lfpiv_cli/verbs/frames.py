@@ -13,25 +13,21 @@ from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Floats
+from lfpiv_cli.calibration import light_checks
 from lfpiv_cli.calibration.lens_light import LensImages
-from lfpiv_cli.calibration.light_checks import (
-    exposure_notices,
-    level_notices,
-    position_notices,
-    saturated_share,
-    uniform_notices,
-)
 from lfpiv_cli.calibration.rectification import Rectification
 from lfpiv_cli.calibration.sheet import sheet_fit
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.files import images as image_files
 from lfpiv_cli.files.batch import Frame
 from lfpiv_cli.files.config import Config
+from lfpiv_cli.files.inputs import given
 from lfpiv_cli.files.provenance import seconds_between, sha256
 from lfpiv_cli.files.weights_file import WeightsFile
 from lfpiv_cli.notice import Notice, written
@@ -52,6 +48,7 @@ from lfpiv_cli.robust import HALF_NORMAL_MEDIAN, MAD_TO_SIGMA
 # Beyond so much the two are not the same.
 CONTRADICTING_SHARE = 0.01
 
+Found = TypeVar("Found")
 # Reads frame `number`: raw, and with dark or background taken off.
 Read = Callable[[int], tuple[Image, Image]]
 
@@ -95,6 +92,40 @@ class Background:
         return range(first, first + count)
 
 
+@dataclass(frozen=True, kw_only=True)
+class ImageOptions:
+    """What is taken off images, and what of them is left out.
+
+    Attributes
+    ----------
+    dark : image taken with the cap on; its hot and dead pixels are left out
+    background : image to subtract, or `minimum` or `mean` over the images, or as `minimum:15`
+    mask : image that is black where pixels are left out, or `still`: where bright light does not move in the images
+    """
+
+    dark: Path | None = None
+    background: str | None = None
+    mask: str | Path | None = None
+
+    @property
+    def level(self) -> Background:
+        """The background."""
+        return Background.parse(self.background)
+
+    @property
+    def mask_file(self) -> Path | None:
+        """The mask, where it is a file."""
+        return None if self.mask in (None, STILL) else Path(str(self.mask))
+
+    def files(self, weights: Path) -> dict[str, Path]:
+        """Return the files that all frames are made from by their roles."""
+        return given(weights=weights, dark=self.dark, background=self.level.path, mask=self.mask_file)
+
+    def dark_image(self, shape: tuple[int, int]) -> Image | None:
+        """Read the dark image."""
+        return image_files.read_reference(self.dark, shape) if self.dark else None
+
+
 def reader(
     level: Background, frames: Sequence[Frame], shape: tuple[int, int], dark: Image | None, keep_going: bool = False
 ) -> Read:
@@ -111,7 +142,7 @@ def reader(
 
     @lru_cache(maxsize=1)
     def over(numbers: range) -> NDArray[np.float32]:
-        return BACKGROUNDS[level.kind or ""](_readable(page, numbers, keep_going))
+        return BACKGROUNDS[level.kind or ""](readable(page, numbers, keep_going))
 
     def read(number: int) -> tuple[Image, Image]:
         numbers = level.around(number, len(frames))
@@ -122,18 +153,13 @@ def reader(
 
 
 def read_frame(frame: Frame, shape: tuple[int, int]) -> Image:
-    """Read a frame.
-
-    Raises
-    ------
-    InputError : it cannot be read, or has another shape
-    """
+    """Read a frame (InputError: it cannot be read, or has another shape)."""
     if frame.fault is not None:
         raise InputError(frame.fault)
     return image_files.read_page(frame.path, frame.page, shape)
 
 
-def _readable(read: Callable[[int], Image], numbers: Iterable[int], keep_going: bool) -> Iterator[Image]:
+def readable(read: Callable[[int], Found], numbers: Iterable[int], keep_going: bool) -> Iterator[Found]:
     """Yield images, those that cannot be read left out where the others are to go on."""
     for number in numbers:
         try:
@@ -146,18 +172,14 @@ def _readable(read: Callable[[int], Image], numbers: Iterable[int], keep_going: 
 
 
 def mask_of(
-    given: str | Path | None,
-    frames: Sequence[Frame],
-    shape: tuple[int, int],
-    pitch_px: float,
-    keep_going: bool = False,
+    mask: str | Path | None, frames: Sequence[Frame], shape: tuple[int, int], pitch_px: float, keep_going: bool = False
 ) -> Image | None:
     """Return the mask, 0 where pixels are left out: of a file, or of what does not move in the frames (`still`)."""
-    if given is None:
+    if mask is None:
         return None
-    if given != STILL:
-        return image_files.read_reference(Path(given), shape)
-    images = _readable(lambda number: read_frame(frames[number], shape), range(len(frames)), keep_going)
+    if mask != STILL:
+        return image_files.read_reference(Path(mask), shape)
+    images = readable(lambda number: read_frame(frames[number], shape), range(len(frames)), keep_going)
     still = still_light(images, pitch_px)
     return np.where(still, np.float32(0.0), np.float32(1.0))
 
@@ -207,24 +229,6 @@ def other_frames(level: Background, frames: Sequence[Frame], mask: str | Path | 
     return words
 
 
-def sequence_digests(level: Background, frames: Sequence[Frame], mask: str | Path | None = None) -> list[str]:
-    """Return for each frame which other frames its background and mask are made from, as words for its record."""
-    words = other_frames(level, frames, mask)
-    return [words(number) for number in range(len(frames))]
-
-
-def beside_frames(
-    words: Callable[[int], str], frames: Sequence[Frame], beside: Sequence[tuple[int, ...]]
-) -> Callable[[int], str]:
-    """Return the function that says which frames help one, besides those of its own background and mask (`words`)."""
-
-    def alone(number: int) -> str:
-        frame = frames[number]
-        return f", beside page {frame.page}{words(number)} of SHA-256 {sha256(frame.path)}"
-
-    return lambda number: "".join([words(number), *(alone(k) for k in beside[number] if frames[k].fault is None)])
-
-
 Progress = Callable[[int], None]
 
 # The brightest of some millions of pixels stands 5.2 standard deviations out of normal noise.
@@ -257,7 +261,7 @@ class Bench:
     excluded: Mask
     sums: Normalisers | None
     lens_images: LensImages
-    light_covariance: NDArray[np.float64] | None = None
+    light_covariance: Floats | None = None
 
     def unusable(self, raw: Image) -> Mask:
         """Return which pixels of a raw frame take no part."""
@@ -302,24 +306,16 @@ def bench_of(
         sums = earlier.sums
     else:
         sums = None if weights.on_demand else normalisers(weights.padded, excluded)
-    return Bench(content, settings, dark, lasting, excluded, sums, _lens_images(content))
-
-
-def _lens_images(content: WeightsFile) -> LensImages:
-    """Return the lens images that weights were made for: calibrated, or the data sheet's."""
-    found, camera = content.weights.calibration, content.camera
-    if found is None:
-        return LensImages.of(Rectification(sheet_fit(camera), content.image_shape), None, camera.lens_image_width)
-    return LensImages.of(found.rectification, found.transmission, camera.lens_image_width)
+    # The lens images that the weights were made for: calibrated, or the data sheet's.
+    calibration, camera = weights.calibration, content.camera
+    rectification = calibration.rectification if calibration else Rectification(sheet_fit(camera), content.image_shape)
+    transmission = calibration.transmission if calibration else None
+    lens_images = LensImages.of(rectification, transmission, camera.lens_image_width)
+    return Bench(content, settings, dark, lasting, excluded, sums, lens_images)
 
 
 def check_frame(bench: Bench, raw: Image, place: str) -> None:
-    """Refuse a raw frame that shows nothing at all: no pixel is usable, or it has one value everywhere.
-
-    Raises
-    ------
-    InputError
-    """
+    """Refuse a raw frame that shows nothing at all: no pixel is usable, or it has one value everywhere (InputError)."""
     if raw.min() == raw.max():
         raise InputError(f"{place}: has one value everywhere ({raw.flat[0]:g}); it shows no particles")
     if bench.unusable(raw).all():
@@ -330,9 +326,13 @@ def frame_notices(bench: Bench, raw: Image, lit: Image, name: str) -> list[Notic
     """Return what speaks against a raw frame, given also with dark or background taken off (`lit`)."""
     unusable = bench.unusable(raw)
     seen, used = np.where(unusable, np.float32(np.nan), lit), lit[~unusable]
-    share = saturated_share(seen, unusable & ~bench.lasting, bench.lens_images.background(seen))
-    notices = exposure_notices(share, name)
-    brightest, noise = float(used.max() - np.median(used)), _noise(used)
+    share = light_checks.saturated_share(seen, unusable & ~bench.lasting, bench.lens_images.background(seen))
+    notices = light_checks.exposure_notices(share, name)
+    # At most the standard deviation of the noise: by what lies below 0, or around the median.
+    noise, below = MAD_TO_SIGMA * float(np.median(np.abs(used - np.median(used)))), used[used < 0.0]
+    if below.size:
+        noise = min(noise, float(np.median(-below)) / HALF_NORMAL_MEDIAN)
+    brightest = float(used.max() - np.median(used))
     if brightest <= NOISE_SIGMAS * noise:
         text = (
             f"its brightest pixel is {written(brightest)} counts above the others, with a noise of "
@@ -340,21 +340,14 @@ def frame_notices(bench: Bench, raw: Image, lit: Image, name: str) -> list[Notic
         )
         remedy = "check light, exposure and the order of the frames"
         notices.append(Notice("frame-dark", name, text, remedy, brightest, f"above {written(NOISE_SIGMAS * noise)}"))
-    return [*notices, *_light_notices(bench, seen, name)]
-
-
-def _light_notices(bench: Bench, lit: Image, name: str) -> list[Notice]:
-    """Return what the light of a frame, its unusable pixels NaN, says against it and the calibration."""
     images, calibration = bench.lens_images, bench.content.weights.calibration
-    notices = [] if calibration is None else list(uniform_notices(images, calibration.fit, lit, name))
-    return [*notices, *level_notices(images, lit, name), *position_notices(images, lit, name, MOVED_SINCE_CALIBRATION)]
-
-
-def _noise(counts: NDArray[np.float32]) -> float:
-    """Return at most the standard deviation of an image's noise: by what lies below 0, or around the median."""
-    noise = MAD_TO_SIGMA * float(np.median(np.abs(counts - np.median(counts))))
-    below = counts[counts < 0.0]
-    return min(noise, float(np.median(-below)) / HALF_NORMAL_MEDIAN) if below.size else noise
+    if calibration is not None:
+        notices += light_checks.uniform_notices(images, calibration.fit, seen, name)
+    return [
+        *notices,
+        *light_checks.level_notices(images, seen, name),
+        *light_checks.position_notices(images, seen, name, MOVED_SINCE_CALIBRATION),
+    ]
 
 
 def picture_for(weights: WeightsFile, picture: NDArray[Any]) -> Image:

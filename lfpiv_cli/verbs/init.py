@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from lfpiv_cli.console import CONSOLE, Console
-from lfpiv_cli.errors import InputError, UsageError
+from lfpiv_cli.errors import UsageError
 from lfpiv_cli.files import calibration_file
 from lfpiv_cli.files.atomic import ensure_writable, write_text
 from lfpiv_cli.files.config import Config, carried_config
@@ -41,7 +41,20 @@ def init(output: Path, options: InitOptions, *, overwrite: bool = False, console
     """Write a configuration, once it has been found to be without contradictions."""
     inputs = [] if options.calibration is None else [options.calibration]
     ensure_writable(output, overwrite, inputs)
-    title, tree = _described(options)
+    given = [each for each in (options.numbers, options.camera, options.calibration) if each is not None]
+    if len(given) != 1:
+        raise UsageError(f"a configuration is from numbers, a camera or a calibration; {len(given)} of them were given")
+    tree: Mapping[str, Any]
+    if options.calibration is not None:
+        _, made = read_tree(options.calibration, calibration_file.FORMAT, (calibration_file.VERSION,))
+        sections = carried_config(made, options.calibration).sections
+        title = f"The rig that {options.calibration.name} was made with, by `lfpiv init`."
+        tree = sections.model_dump(mode="json", exclude_defaults=True)
+    elif options.camera is not None:
+        title = f"The camera {options.camera}, by `lfpiv init`."
+        tree = tree_of(TABLE2) if options.camera == "table2" else {"camera": LATTICES[options.camera]}
+    elif options.numbers is not None:
+        title, tree = "A rig, by `lfpiv init`.", tree_of(options.numbers)
     settings = Config.from_resolved(tree, "the numbers given")
     beside = SCHEMA_NAME if (output.parent / SCHEMA_NAME).exists() else None
     write_text(output, rig_text(tree, title, beside), overwrite)
@@ -57,21 +70,3 @@ def write_schema(output: Path, *, overwrite: bool = False) -> dict[str, Any]:
     content = schema()
     write_text(output, json.dumps(content, indent=2) + "\n", overwrite)
     return {"schema": output.name, "sections": list(content["properties"])}
-
-
-def _described(options: InitOptions) -> tuple[str, Mapping[str, Any]]:
-    """Return the first comment of a configuration, and its sections."""
-    given = [each for each in (options.numbers, options.camera, options.calibration) if each is not None]
-    if len(given) != 1:
-        raise UsageError(f"a configuration is from numbers, a camera or a calibration; {len(given)} of them were given")
-    if options.numbers is not None:
-        return "A rig, by `lfpiv init`.", tree_of(options.numbers)
-    if options.camera is not None:
-        tree = tree_of(TABLE2) if options.camera == "table2" else {"camera": LATTICES[options.camera]}
-        return f"The camera {options.camera}, by `lfpiv init`.", tree
-    if options.calibration is None:
-        raise InputError("no calibration")
-    _, made = read_tree(options.calibration, calibration_file.FORMAT, (calibration_file.VERSION,))
-    sections = carried_config(made, options.calibration).sections
-    tree = sections.model_dump(mode="json", exclude_defaults=True)
-    return f"The rig that {options.calibration.name} was made with, by `lfpiv init`.", tree

@@ -9,14 +9,13 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Any, Generic, TypeVar
 
 from lfpiv_cli.console import Console, Frames
 from lfpiv_cli.errors import InputError, UsageError
 from lfpiv_cli.files import images as image_files
 from lfpiv_cli.files import vtkhdf
 from lfpiv_cli.files.batch import Frame, State, Target, images_seen, pending, results_seen, state_or_none
-from lfpiv_cli.files.config import Config
 from lfpiv_cli.files.listing import as_they_come, files_in
 from lfpiv_cli.files.pairing import Pairs, Seen, contradiction, in_order, pair_frames, pairs_listed
 from lfpiv_cli.files.provenance import Gone, carried_record, sha256, without_warnings
@@ -35,7 +34,7 @@ from lfpiv_cli.verbs.batches import (
     stamp_of,
     work_through,
 )
-from lfpiv_cli.verbs.frames import STILL, Background, residual_path
+from lfpiv_cli.verbs.frames import residual_path
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -120,15 +119,6 @@ def result_pairs(paths: Sequence[Path], options: PairOptions) -> Pairs:
     return _found(results_seen(paths), options)
 
 
-def sequence_of(paths: Sequence[Path]) -> tuple[list[int], list[Notice]]:
-    """Return files of particles in the order of time, by their names, and what is to be said of it.
-
-    Two are taken as they are given.
-    """
-    frames = results_seen(paths)
-    return ([0, 1], _doubts(frames)) if len(frames) == 2 else in_order(frames)
-
-
 def _found(frames: Sequence[Seen], options: PairOptions) -> Pairs:
     """Return which frames belong together: by a list, by names; without options two as they are given.
 
@@ -148,10 +138,10 @@ def _found(frames: Sequence[Seen], options: PairOptions) -> Pairs:
         raise UsageError(
             f"{len(frames)} frames need --pairing: ab for separate pairs or sequence for each with the next"
         )
-    return Pairs(((0, 1),), notices=tuple(_doubts(frames)))
+    return Pairs(((0, 1),), notices=tuple(doubts(frames)))
 
 
-def _doubts(frames: Sequence[Seen]) -> list[Notice]:
+def doubts(frames: Sequence[Seen]) -> list[Notice]:
     """Say of two frames that are taken as they are given where their names contradict it."""
     first, second = frames
     if (why := contradiction(first, second)) is not None:
@@ -171,12 +161,7 @@ def _doubts(frames: Sequence[Seen]) -> list[Notice]:
 OfBatch = TypeVar("OfBatch", bound=Batch)
 
 
-def watched(
-    folders: Sequence[Path],
-    kind: InputKind,
-    options: BatchOptions,
-    console: Console,
-) -> Iterator[list[Path]]:
+def watched(folders: Sequence[Path], kind: InputKind, options: BatchOptions, console: Console) -> Iterator[list[Path]]:
     """Yield the files of folders in groups, as they become complete: see `as_they_come`.
 
     Raises
@@ -192,7 +177,14 @@ def watched(
     for folder in folders:
         if not os.path.isdir(folder):
             raise UsageError(f"{folder}: --watch takes folders")
-    read = _read_image if kind == "images" else vtkhdf.read_header
+
+    def read(path: Path) -> None:
+        if kind == "images":
+            # The others are there when the last one is.
+            image_files.read_page(path, image_files.count_pages(path) - 1)
+        else:
+            vtkhdf.read_header(path)
+
     deadline, count = options.deadline(), 0
     console.say(f"watches {', '.join(map(str, folders))}; ends {options.idle_s:g} s after the last change")
 
@@ -208,36 +200,18 @@ def watched(
         raise InputError(f"{folders[0]}: no {kind} have come in {options.idle_s:g} s")
 
 
-def ensure_frames_alone(settings: Config, background: str | None, mask: str | Path | None) -> None:
-    """Refuse what is made from other frames than a frame's own, where these are still coming.
-
-    Raises
-    ------
-    UsageError
-    """
-    if Background.parse(background).kind is not None:
-        refused = f"--background {background} is"
-    elif mask == STILL:
-        refused = f"--mask {STILL} is"
-    elif settings.reconstruction.solver == "particles":
-        refused = "the tracers' size, which --solver particles needs, is"
-    else:
-        return
-    raise UsageError(f"--watch: {refused} made from all frames, some of which have not come yet; wait for them")
-
-
 def work_as_they_come(
     make: Callable[[Sequence[Path]], OfBatch],
     groups: Iterable[Sequence[Path]],
     options: BatchOptions,
     console: Console,
-    left_out: Callable[[], Sequence[Failure]] = tuple,
+    left_out: Sequence[Failure] = (),
 ) -> tuple[OfBatch, Worked]:
     """Work through a batch for each group of files; return the last one, and what became of all.
 
     Parameters
     ----------
-    left_out : returns, at the end, the files that were in no group
+    left_out : the files that were in no group, as known at the end
 
     Raises
     ------
@@ -256,62 +230,44 @@ def work_as_they_come(
             together.failures.append(Failure(group[0].stem, str(error)))
         else:
             together.add(work_through(batch, alone, console))
-    together.failures[:0] = left_out()
+    together.failures[:0] = left_out
     if batch is None:
         raise InputError(f"{together.failures[0].name}: {together.failures[0].error}")
     together.list_failures(options.failures)
     return batch, together
 
 
-class ComingPairs:
-    """The pairs of files that come one after the other.
+def coming_pairs(
+    coming: Iterable[Sequence[Path]], pair: Callable[[Sequence[Path]], Pairs], console: Console, left_out: list[Failure]
+) -> Iterator[list[Path]]:
+    """Yield the files of pairs that are complete, two by two, as they come.
 
-    Attributes
+    Parameters
     ----------
-    left_out : the files of which no partner has come so far
+    pair : tells which of some files are pairs
+    left_out : is kept at the files of which no partner has come so far
     """
-
-    def __init__(self, pair: Callable[[Sequence[Path]], Pairs], console: Console) -> None:
-        """Take which of some files are pairs, and where it is told of those that are passed over."""
-        self._pair, self._console = pair, console
-        self._seen: list[Path] = []
-        self._made: set[tuple[int, int]] = set()
-        self._told: set[Notice] = set()
-        self.left_out: Sequence[Failure] = ()
-
-    def groups(self, coming: Iterable[Sequence[Path]]) -> Iterator[list[Path]]:
-        """Yield the files of pairs that are complete, two by two, as they come."""
-        for files in coming:
-            self._seen += files
-            if len(self._seen) < 2:
-                self.left_out = [Failure(str(self._seen[0]), "no other frame has come")]
-                continue
-            found = self._pair(self._seen)
-            fresh = [pair for pair in found.pairs if pair not in self._made]
-            self._made.update(fresh)
-            self.left_out = failures_of(found)
-            self._tell(found)
-            if fresh:
-                yield [self._seen[number] for pair in fresh for number in pair]
-
-    def _tell(self, found: Pairs) -> None:
-        """Say once what is taken for granted, and which files have no partner though later pairs are complete."""
-        last = max((second for _, second in self._made), default=0)
-        before = {str(path) for path in self._seen[:last]}
+    seen: list[Path] = []
+    made: set[tuple[int, int]] = set()
+    told: set[Notice] = set()
+    for files in coming:
+        seen += files
+        if len(seen) < 2:
+            left_out[:] = [Failure(str(seen[0]), "no other frame has come")]
+            continue
+        found = pair(seen)
+        fresh = [each for each in found.pairs if each not in made]
+        made.update(fresh)
+        left_out[:] = failures_of(found)
+        # Once: what is taken for granted, and files that have no partner though later pairs are complete.
+        last = max((second for _, second in made), default=0)
+        before = {str(path) for path in seen[:last]}
         passed = Pairs((), tuple(each for each in found.left_out if each.name in before), found.notices)
-        fresh = [notice for notice in passed.said() if notice not in self._told]
-        self._told.update(fresh)
-        self._console.warn(fresh)
-
-
-def _read_image(path: Path) -> None:
-    """Read the last frame of an image file: the others are there when it is.
-
-    Raises
-    ------
-    InputError : it cannot be read yet
-    """
-    image_files.read_page(path, image_files.count_pages(path) - 1)
+        unsaid = [notice for notice in passed.said() if notice not in told]
+        told.update(unsaid)
+        console.warn(unsaid)
+        if fresh:
+            yield [seen[number] for numbers in fresh for number in numbers]
 
 
 # Pairs whose volumes or particles are dropped as soon as their vectors stand.
@@ -322,13 +278,6 @@ def _read_image(path: Path) -> None:
 # last of its pairs.
 
 
-class Join(Protocol[Made]):
-    """Makes the batch of one pair: of the files of its frames, of which some may be gone, into one file."""
-
-    def __call__(self, pair: Sequence[Path], output: Path, gone: Mapping[Path, Gone]) -> Batch[Made]:
-        """Return it."""
-
-
 class PairByPair(Batch[Made]):
     """The batch of pairs, each from its two images to its vectors."""
 
@@ -337,13 +286,13 @@ class PairByPair(Batch[Made]):
     def __init__(
         self,
         found: Batch[Any],
-        join: Join[Made],
+        of_pair: Callable[[Sequence[Path], Path, Pairs, Mapping[Path, Gone]], Batch[Made]],
         pairs: Pairs,
         targets: Sequence[Target],
         file_bytes: float | None = None,
     ) -> None:
-        """Take the batch of the frames, what joins two of them, where its results go, and how large one is if known."""
-        self._found, self._join, self._pairs = found, join, pairs.pairs
+        """Take the batch of the frames, what makes that of two of them, where results go, and how large one is."""
+        self._found, self._of_pair, self._pairs = found, of_pair, pairs.pairs
         self._file_bytes = file_bytes
         self.label, self.overwrite = found.label, found.overwrite
         self.targets = [replace(each, make_record=partial(self._record, k)) for k, each in enumerate(targets)]
@@ -361,39 +310,30 @@ class PairByPair(Batch[Made]):
     def begin(self, numbers: Sequence[int], console: Console) -> float:
         """Prepare the frames of the pairs that are to be made; drop those that no pair needs."""
         every = list(dict.fromkeys(k for number in numbers for k in self._pairs[number]))
-        left = self._left_of(every) if every else []
+        frames = [self._found.targets[k] for k in every]
+        left = [every[k] for k in pending(frames, self.inputs, self.overwrite, resume=True)] if every else []
         self._whole = {k: stamp_of(self._found.targets[k].path) for k in set(every) - set(left)}
         steps = self._found.begin(left, console)
         self._drop(range(len(self._found.targets)))
         # Where all frames are there, what joins them is a step.
         return max(steps * len(left) / max(len(numbers), 1), 1.0)
 
-    def _left_of(self, every: Sequence[int]) -> list[int]:
-        """Return the frames that have to be made."""
-        frames = [self._found.targets[k] for k in every]
-        return [every[k] for k in pending(frames, self.inputs, self.overwrite, resume=True)]
-
     def make(self, number: int, work: Frames) -> Made:
         """Make the files of two frames, where they are not there, and of these the result."""
         for k in self._pairs[number]:
-            self._ensure_made(k, work)
-        joined = self._joined(number, {})
+            target = self._found.targets[k]
+            stamp = stamp_of(target.path)
+            if stamp is None or self._whole.get(k) != stamp:
+                with awaited(target.path):
+                    if state_or_none(target) is not State.COMPLETE:
+                        self._found.make(k, work)
+                self._whole[k] = stamp_of(target.path)
+        joined = self._join(number, {})
         joined.begin([0], work.console)
         made = joined.make(0, work)
         self._complete.add(number)
         self._drop(self._pairs[number])
         return made
-
-    def _ensure_made(self, k: int, work: Frames) -> None:
-        """Make the file of a frame, unless it is there and complete, or another worker makes it."""
-        target = self._found.targets[k]
-        stamp = stamp_of(target.path)
-        if stamp is not None and self._whole.get(k) == stamp:
-            return
-        with awaited(target.path):
-            if state_or_none(target) is not State.COMPLETE:
-                self._found.make(k, work)
-        self._whole[k] = stamp_of(target.path)
 
     def _is_complete(self, number: int) -> bool:
         """Return whether the result of a pair is there, by whichever worker."""
@@ -421,39 +361,28 @@ class PairByPair(Batch[Made]):
         """Return how large a result is, and what is held while the files of a frame are made."""
         return Expected(self._file_bytes, self._found.expected().memory_bytes)
 
-    def _joined(self, number: int, gone: Mapping[Path, Gone]) -> Batch[Made]:
-        paths = [self._found.targets[k].path for k in self._pairs[number]]
-        return self._join(paths, self.targets[number].path, gone)
-
     def _record(self, number: int) -> Mapping[str, Any]:
-        """Return the record of a result, of its frames' files as they will be."""
-        targets = [self._found.targets[k] for k in self._pairs[number]]
-        to_come = {target.path: self._to_come(target, self.targets[number].path) for target in targets}
-        gone = {path: file for path, file in to_come.items() if file is not None}
-        return self._joined(number, gone).targets[0].record
+        """Return the record of a result, of its frames' files as they will be.
 
-    def _to_come(self, frame: Target, result: Path) -> Gone | None:
-        """Return a frame's file where it is gone, with the hash that the result carries, or is to carry another record.
-
-        None where it is there and stays as it is.
+        Of a file that is gone the hash is the one that the result carries; one that is there and stays as it is tells
+        of itself.
         """
-        carried: Mapping[str, Any]
-        if frame.path.exists():
-            carried, digest = carried_record(frame.path), sha256(frame.path)
-            if without_warnings(carried) == frame.record:
-                return None
-        else:
-            made = carried_record(result)
-            digest = {each["name"]: each["sha256"] for each in made["inputs"].values()}.get(frame.path.name, "")
-            carried = made["made_from"].get(digest, {})
-        return Gone(digest, {**frame.record, **{name: carried[name] for name in ("warnings",) if name in carried}})
+        gone: dict[Path, Gone] = {}
+        for frame in (self._found.targets[k] for k in self._pairs[number]):
+            carried: Mapping[str, Any]
+            if frame.path.exists():
+                carried, digest = carried_record(frame.path), sha256(frame.path)
+                if without_warnings(carried) == frame.record:
+                    continue
+            else:
+                made = carried_record(self.targets[number].path)
+                digest = {each["name"]: each["sha256"] for each in made["inputs"].values()}.get(frame.path.name, "")
+                carried = made["made_from"].get(digest, {})
+            warned = {name: carried[name] for name in ("warnings",) if name in carried}
+            gone[frame.path] = Gone(digest, {**frame.record, **warned})
+        return self._join(number, gone).targets[0].record
 
-
-def joined_by(make: Callable[..., Batch[Made]], *options: Any) -> Join[Made]:
-    """Return what makes the batch of one pair, by the class of the batch and what it takes besides."""
-    one = Pairs(((0, 1),))
-
-    def join(pair: Sequence[Path], output: Path, gone: Mapping[Path, Gone]) -> Batch[Made]:
-        return make(pair, output, *options, one, gone)
-
-    return join
+    def _join(self, number: int, gone: Mapping[Path, Gone]) -> Batch[Made]:
+        """Return the batch of one pair: of the files of its frames, of which some may be gone, into one file."""
+        paths = [self._found.targets[k].path for k in self._pairs[number]]
+        return self._of_pair(paths, self.targets[number].path, Pairs(((0, 1),)), gone)

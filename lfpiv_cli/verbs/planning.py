@@ -5,6 +5,7 @@ A line is good, or worth a look, or says that the experiment cannot work so; or 
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -13,6 +14,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.calibration.model import Calibration
 from lfpiv_cli.calibration.sheet import LARGE_F_RATIO, LARGEST_F_RATIO
 from lfpiv_cli.errors import ConfigError, InputError
@@ -30,9 +32,9 @@ from lfpiv_cli.synthetic.sensor import Readout
 from lfpiv_cli.validation import planning
 from lfpiv_cli.validation.planning import Miniature, Tracer
 from lfpiv_cli.verbs.build_weights import ray_source
+from lfpiv_cli.verbs.checks import WORDS, Word
 from lfpiv_cli.verbs.particles import light_of
-from lfpiv_cli.verbs.verdicts import WORDS, Word
-from lfpiv_cli.verbs.weights_cost import check_rig, cost_notices, cost_of, particles_core_s, rig_notices
+from lfpiv_cli.verbs.weights_cost import TRACER_S, Cost, check_rig, cost_notices, cost_of, rig_notices
 from lfpiv_cli.weights.build import default_padding
 from lfpiv_cli.weights.scene import Source
 
@@ -51,8 +53,8 @@ GOOD_ERROR, LARGEST_ERROR = 0.05, 0.25
 GOOD_VOXEL, LARGEST_VOXEL = 0.55, 1.05
 # Sides of windows that differ by less are alike: they are written with few digits.
 WINDOWS_ALIKE = 0.02
-# Of the coarse window's side: up to the one displacements are measured well, beyond the other hardly at all.
-GOOD_SHARE_OF_WINDOW, LARGEST_SHARE_OF_WINDOW = 0.25, 0.5
+# Of the coarse window's side: beyond it displacements are hardly measured at all.
+LARGEST_SHARE_OF_WINDOW = 0.5
 # By waves each depth takes about a second.
 DEPTHS, DEPTHS_BY_WAVES = 21, 11
 # Light of frequency-doubled lasers, where no wavelength is given. A microlens that spreads it over less of a pixel than
@@ -104,28 +106,23 @@ class Bench:
         return self.camera.scale(self.media)
 
     @property
-    def knows_mid_plane(self) -> bool:
-        """Whether a calibration tells where a channel's mid plane lies."""
-        return self.found is not None and self.found.mid_plane_z_mm is not None
-
-    @property
     def mid_plane_z_mm(self) -> float:
         """Depth of a channel's mid plane; where it is not known, the camera is focused on it."""
         return (self.found.mid_plane_z_mm if self.found else None) or 0.0
 
     @property
-    def bounds_mm(self) -> NDArray[np.float64]:
+    def bounds_mm(self) -> Floats:
         """(3, 2) of the volume, z from the focal point."""
         return np.array([self.grid.bounds_mm(axis) for axis in range(3)])
 
     @property
-    def depths_mm(self) -> NDArray[np.float64]:
+    def depths_mm(self) -> Floats:
         """Depths of the volume, from the focal point."""
         count = DEPTHS if self.settings.reconstruction.wavelength_nm is None else DEPTHS_BY_WAVES
         return np.linspace(self.bounds_mm[2, 0], self.bounds_mm[2, 1], count)
 
     @property
-    def sides_mm(self) -> NDArray[np.float64]:
+    def sides_mm(self) -> Floats:
         """(3,) of the volume."""
         return np.diff(self.bounds_mm)[:, 0]
 
@@ -135,11 +132,11 @@ class Bench:
         return self.settings.correlation_settings(self.grid.spacing_mm).layout(self.grid.shape_xyz)
 
     @cached_property
-    def errors_mm(self) -> NDArray[np.float64]:
+    def errors_mm(self) -> Floats:
         """Smallest errors (n, 3) of simulated tracers at `depths_mm`."""
         return self.errors_of(self.tracer())
 
-    def errors_of(self, tracer: Tracer) -> NDArray[np.float64]:
+    def errors_of(self, tracer: Tracer) -> Floats:
         """Return the smallest errors (n, 3) of a tracer at `depths_mm`, beyond what can be refocused of its end."""
         seen, places = self.seen
         return planning.errors_by_depth_mm(seen, tracer)[places]
@@ -174,8 +171,15 @@ def bench_of(settings: Config, found: Calibration | None, velocity_m_s: float | 
     z_mm = 0.0 if found is None or found.mid_plane_z_mm is None else found.mid_plane_z_mm
     named = settings.volume.reference
     grid = settings.grid(Reference(named, z_mm if named == "mid_plane" else 0.0))
-    velocity = velocity_m_s if velocity_m_s is not None else _configured_speed_m_s(settings)
-    return Bench(settings, found, camera, settings.media_model(), grid, velocity)
+    if velocity_m_s is None:
+        # That of the configured flow in the volume, where there is a flow.
+        with contextlib.suppress(ConfigError):
+            flow, volume = settings.true_flow(), settings.grid()
+            axes = [np.linspace(*volume.bounds_mm(axis), FLOW_POINTS) for axis in range(3)]
+            points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+            speed = float(np.percentile(np.linalg.norm(flow(points), axis=1), FAST_PERCENTILE))
+            velocity_m_s = speed if speed > 0.0 else None
+    return Bench(settings, found, camera, settings.media_model(), grid, velocity_m_s)
 
 
 def rig_lines(bench: Bench) -> list[Line]:
@@ -224,10 +228,17 @@ def rig_figures(bench: Bench) -> dict[str, Any]:
         "expected_velocity_m_s": bench.velocity_m_s,
         "best_dt_s": _best_time_s(bench),
     }
-    return figures | {"estimated_particles_core_s": particles_core_s(best)} | _cost_figures(bench)
+    figures["estimated_particles_core_s"] = TRACER_S * best
+    # Bytes and seconds for one image, where the rig can be worked with at all.
+    with contextlib.suppress(ConfigError, InputError):
+        figures |= _cost_of(bench).summary() | {
+            "image_file_bytes": PIXEL_BYTES * camera.columns * camera.rows,
+            "volume_file_bytes": VOXEL_BYTES * int(np.prod(bench.grid.shape_xyz)),
+        }
+    return figures
 
 
-def by_depth(bench: Bench) -> dict[str, NDArray[np.float64]]:
+def by_depth(bench: Bench) -> dict[str, Floats]:
     """Return errors and fields of view by depth, for a picture."""
     depths, camera, media = bench.depths_mm, bench.camera, bench.media
     return {
@@ -236,19 +247,6 @@ def by_depth(bench: Bench) -> dict[str, NDArray[np.float64]]:
         "full_view_mm": planning.half_view_mm(camera, media, depths),
         "any_view_mm": planning.half_view_mm(camera, media, depths, 1.0),
     }
-
-
-def _configured_speed_m_s(settings: Config) -> float | None:
-    """Return the speed of the configured flow in the volume, None where there is no flow."""
-    try:
-        flow = settings.true_flow()
-    except ConfigError:
-        return None
-    grid = settings.grid()
-    axes = [np.linspace(*grid.bounds_mm(axis), FLOW_POINTS) for axis in range(3)]
-    points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    speed = float(np.percentile(np.linalg.norm(flow(points), axis=1), FAST_PERCENTILE))
-    return speed if speed > 0.0 else None
 
 
 def graded(value: float, good: float, limit: float) -> Verdict:
@@ -363,7 +361,9 @@ def error_verdict(bench: Bench, depth_error_mm: float) -> Verdict:
 
 
 def _seeding(bench: Bench) -> Line:
-    return seeding_line(bench, bench.settings.simulation.particles / _lenses(bench), "simulated")
+    # Of the microlenses that look into the volume.
+    lenses = max(planning.tracers_in(bench.camera, 1.0, bench.sides_mm), 1.0)
+    return seeding_line(bench, bench.settings.simulation.particles / lenses, "simulated")
 
 
 def seeding_line(bench: Bench, per_lens: float, what: str) -> Line:
@@ -379,11 +379,6 @@ def seeding_line(bench: Bench, per_lens: float, what: str) -> Line:
     if per_lens > planning.CROWDED_PER_LENS:
         reason += ": neighbours are taken for one another, volumes err less than particles"
     return Line("seeding", graded(per_lens, planning.CROWDED_PER_LENS, planning.MOST_PER_LENS), reason)
-
-
-def _lenses(bench: Bench) -> float:
-    """Return the microlenses that look into the volume."""
-    return max(planning.tracers_in(bench.camera, 1.0, bench.sides_mm), 1.0)
 
 
 def _voxels(bench: Bench) -> Line:
@@ -460,18 +455,7 @@ def _time_step(bench: Bench) -> Line:
     return Line(about, "no" if beyond else "look", f"{reason}; {advice}")
 
 
-def _cost_figures(bench: Bench) -> dict[str, Any]:
-    """Return bytes and seconds for one image, where the rig can be worked with at all."""
-    try:
-        return _cost_of(bench).summary() | {
-            "image_file_bytes": PIXEL_BYTES * bench.camera.columns * bench.camera.rows,
-            "volume_file_bytes": VOXEL_BYTES * int(np.prod(bench.grid.shape_xyz)),
-        }
-    except (ConfigError, InputError):
-        return {}
-
-
-def _cost_of(bench: Bench) -> Any:
+def _cost_of(bench: Bench) -> Cost:
     settings, camera = bench.settings, bench.camera
     padding = settings.reconstruction.padding_voxel or default_padding(camera, bench.media, bench.grid)
     return cost_of(settings, camera, _source(bench), bench.grid.padded(padding))
@@ -486,7 +470,7 @@ def _cost(bench: Bench) -> Line:
     files = PIXEL_BYTES * bench.camera.columns * bench.camera.rows + VOXEL_BYTES * int(np.prod(bench.grid.shape_xyz))
     reason = (
         f"weights {written(cost.weights_core_s, 2)} s of a core, each image {written(cost.image_core_s, 2)} s by "
-        f"volumes, {written(particles_core_s(best), 2)} s by particles at the best seeding; "
+        f"volumes, {written(TRACER_S * best, 2)} s by particles at the best seeding; "
         f"{written(max(cost.weights_bytes, cost.image_bytes) / 1e9, 2)} GB of memory, {written(files / 1e6, 2)} MB of "
         "disk an image"
     )

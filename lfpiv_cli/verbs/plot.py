@@ -4,48 +4,34 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from lfpiv_cli.console import CONSOLE, Console
-from lfpiv_cli.errors import InputError, UsageError
-from lfpiv_cli.files.atomic import ensure_writable
-from lfpiv_cli.files.hdf5 import format_of
-from lfpiv_cli.files.inputs import given
-from lfpiv_cli.files.pages import ensure_drawing, write_pdf, write_picture
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-from functools import partial
-
 import numpy as np
-from numpy.typing import NDArray
 
-from lfpiv_cli.errors import ConfigError
+from lfpiv_cli.console import CONSOLE, Console
+from lfpiv_cli.errors import ConfigError, InputError, UsageError
 from lfpiv_cli.files import calibration_file, vtkhdf, weights_file
+from lfpiv_cli.files.atomic import ensure_writable
 from lfpiv_cli.files.calibration_file import read_calibration
 from lfpiv_cli.files.config import carried_config
 from lfpiv_cli.files.figures import FIGURES, describe, is_recording, recording_figures
-from lfpiv_cli.files.hdf5 import open_h5
+from lfpiv_cli.files.hdf5 import format_of, open_h5
 from lfpiv_cli.files.hdf5_checks import member
 from lfpiv_cli.files.images import read_image
-from lfpiv_cli.files.particle_file import (
-    PARTICLES_FORMAT,
-    TRACKS_FORMAT,
-    TRAJECTORIES_FORMAT,
-    Points,
-    read_points,
-)
+from lfpiv_cli.files.inputs import given
+from lfpiv_cli.files.pages import ensure_drawing, write_pdf, write_picture
+from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, TRACKS_FORMAT, TRAJECTORIES_FORMAT, Points, read_points
 from lfpiv_cli.files.weights_file import FORMAT, WeightsFile, open_weights
-from lfpiv_cli.flow.field import VectorField
 from lfpiv_cli.notice import written
 from lfpiv_cli.pictures import calibration as of_calibration
-from lfpiv_cli.pictures import points as of_particles
-from lfpiv_cli.pictures import points as of_tracks
+from lfpiv_cli.pictures import points as of_points
 from lfpiv_cli.pictures import vectors as of_vectors
-from lfpiv_cli.pictures import vectors as of_volume
-from lfpiv_cli.pictures import vectors as of_weights
 from lfpiv_cli.verbs.frames import residual_path
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 # The figures that each kind of file has, by its format.
 
@@ -61,6 +47,56 @@ QUALITIES = {
 }
 
 
+# What each figure shows, in a sentence or two. Of some the reader knows more.
+OF_ALL_TRACKS = {
+    "velocities": "The velocity components.",
+    "links": "How probable the links are, and how many wrong ones to expect.",
+    "sigma": "Stated standard deviations of the velocity components by depth, medians.",
+}
+CAPTIONS: dict[str, dict[str, str]] = {
+    vtkhdf.VECTORS_FORMAT: {
+        "planes": "Vectors in the three middle planes. Arrows show the components in the plane, colour the one across "
+        "it; both have one scale in all three. Crosses are vectors that are missing.",
+        "components": "Each velocity component in the three middle planes, a row and a scale for each.",
+        "profiles": "Means of each component over the planes across each axis. The band is the stated standard "
+        "deviation of one vector to both sides.",
+        "sigma": "Stated standard deviation of each component in the three middle planes, all on one logarithmic "
+        "scale.",
+        "flags": "Where vectors are valid, taken from a second peak, replaced by their neighbours, rejected or masked.",
+        "displacements": "Displacements of the valid vectors, and what they are beyond whole voxels and, where the "
+        "camera is known, whole microlenses: crowded about zero where they lock.",
+        "gradients": "Vorticity across the three middle planes, and the divergence, which is zero in a liquid: what it "
+        "shows is the noise of gradients. One scale for both.",
+    },
+    vtkhdf.VOLUME_FORMAT: {
+        "projections": "The brightest voxel along each line of sight, in the three directions, on one scale.",
+        "depths": "The mean intensity of each plane by depth.",
+    },
+    PARTICLES_FORMAT: {
+        "places": "The particles from the front and from the side, coloured by their light.",
+        "image": "The raw image, and where rays through the middle of the main lens (as the config has it) meet the "
+        "sensor.",
+        "residual": "What the particles leave of the image: red is light that none explains, blue is too much light.",
+        "depths": "By depth: how many particles, their light, and the standard deviations of their places.",
+        "chi2": "How well the particles explain the light about them: chi2 is about 1 where they explain all of it.",
+    },
+    TRACKS_FORMAT: OF_ALL_TRACKS,
+    TRAJECTORIES_FORMAT: OF_ALL_TRACKS
+    | {
+        "space": "The trajectories in space, coloured by mean speed.",
+        "lengths": "How many frames the trajectories span.",
+    },
+    calibration_file.FORMAT: {
+        "summary": "How far the lens images lie off the lattice, what pixels pass, and where the board was found.",
+        "lattice": "The lattice on the white image, in the middle and in two corners.",
+    },
+    FORMAT: {
+        "column": "The pixels that the middle voxel lights: its point-spread function.",
+        "light": "How much of a voxel's light meets the sensor, by depth: on the axis, half-way out, and in a corner.",
+    },
+}
+
+
 @dataclass(frozen=True, eq=False)
 class Drawn:
     """A figure that can be drawn: what it shows, in a sentence or two, and the function that draws it."""
@@ -69,50 +105,31 @@ class Drawn:
     draw: Callable[[], Figure]
 
 
-def _of_vectors(path: Path) -> dict[str, Drawn]:
+# A reader's figures: what draws each, or more where the caption depends on the file.
+Figures = dict[str, "Drawn | Callable[[], Figure]"]
+
+
+def _of_vectors(path: Path) -> Figures:
     field = vtkhdf.open_vectors(path)
-    figures = {
-        "planes": Drawn(
-            "Vectors in the three middle planes. Arrows show the components in the plane, colour the one across it; "
-            "both have one scale in all three. Crosses are vectors that are missing.",
-            partial(of_vectors.planes_figure, field),
-        ),
-        "components": Drawn(
-            "Each velocity component in the three middle planes, a row and a scale for each.",
-            partial(of_vectors.components_figure, field),
-        ),
-        "profiles": Drawn(
-            "Means of each component over the planes across each axis. The band is the stated standard deviation of "
-            "one vector to both sides.",
-            partial(of_vectors.profiles_figure, field),
-        ),
+    figures: Figures = {
+        "planes": partial(of_vectors.planes_figure, field),
+        "components": partial(of_vectors.components_figure, field),
+        "profiles": partial(of_vectors.profiles_figure, field),
     }
     if field.uncertainty_voxel is not None and np.isfinite(field.uncertainty_voxel).any():
-        figures["sigma"] = Drawn(
-            "Stated standard deviation of each component in the three middle planes, all on one logarithmic scale.",
-            partial(of_vectors.sigma_figure, field),
-        )
-    figures["flags"] = Drawn(
-        "Where vectors are valid, taken from a second peak, replaced by their neighbours, rejected or masked.",
-        partial(of_vectors.flags_figure, field),
-    )
-    qualities = _qualities(path, field)
+        figures["sigma"] = partial(of_vectors.sigma_figure, field)
+    figures["flags"] = partial(of_vectors.flags_figure, field)
+    # Not what is alike everywhere.
+    with open_h5(path) as file:
+        known = {QUALITIES[name]: np.asarray(member(file, name)) for name in QUALITIES if name in file}
+    reshaped = {words: values.reshape(field.flag.shape) for words, values in known.items()}
+    qualities = {words: each for words, each in reshaped.items() if np.unique(each[np.isfinite(each)]).size > 1}
     if qualities:
-        figures["quality"] = Drawn(
-            f"What else tells how good vectors are: {', '.join(qualities)}.",
-            partial(of_vectors.quality_figure, field, qualities),
-        )
-    figures["displacements"] = Drawn(
-        "Displacements of the valid vectors, and what they are beyond whole voxels and, where the camera is known, "
-        "whole microlenses: crowded about zero where they lock.",
-        partial(of_vectors.displacements_figure, field, _lens_mm(path)),
-    )
+        caption = f"What else tells how good vectors are: {', '.join(qualities)}."
+        figures["quality"] = Drawn(caption, partial(of_vectors.quality_figure, field, qualities))
+    figures["displacements"] = partial(of_vectors.displacements_figure, field, _lens_mm(path))
     if field.dt_s is not None:
-        figures["gradients"] = Drawn(
-            "Vorticity across the three middle planes, and the divergence, which is zero in a liquid: what it shows "
-            "is the noise of gradients. One scale for both.",
-            partial(of_vectors.gradients_figure, field),
-        )
+        figures["gradients"] = partial(of_vectors.gradients_figure, field)
     return figures
 
 
@@ -128,156 +145,87 @@ def _lens_mm(path: Path) -> float | None:
         return None
 
 
-def _qualities(path: Path, field: VectorField) -> dict[str, NDArray[np.float64]]:
-    """Return what the file knows of the vectors' quality, by the words for it; not what is alike everywhere."""
-    with open_h5(path) as file:
-        found: dict[str, NDArray[Any]] = {
-            words: np.asarray(member(file, name)).reshape(field.flag.shape)
-            for name, words in QUALITIES.items()
-            if name in file
-        }
-    return {words: values for words, values in found.items() if np.unique(values[np.isfinite(values)]).size > 1}
-
-
-def _of_particles(path: Path, raw: Path | None) -> dict[str, Drawn]:
+def _of_particles(path: Path, raw: Path | None) -> Figures:
     points = read_points(path, PARTICLES_FORMAT)
     arrays, z_mm = points.arrays, points.position_mm[:, 2]
-    figures = {
-        "places": Drawn(
-            "The particles from the front and from the side, coloured by their light.",
-            partial(of_particles.places_figure, points.position_mm, arrays["intensity"]),
-        )
-    }
+    figures: Figures = {"places": partial(of_points.places_figure, points.position_mm, arrays["intensity"])}
     if raw is not None:
         config = carried_config(points.provenance, path)
         focal_point = points.reference.points_to_focal_point(points.position_mm)
-        places = of_particles.places_px(focal_point, config.camera_model(), config.media_model(), config.scene_space())
+        places = of_points.places_px(focal_point, config.camera_model(), config.media_model(), config.scene_space())
         image = read_image(raw, config.image_shape()).astype(np.float64)
-        figures["image"] = Drawn(
-            "The raw image, and where rays through the middle of the main lens (as the config has it) meet the sensor.",
-            partial(of_particles.image_figure, image, places, z_mm),
-        )
+        figures["image"] = partial(of_points.image_figure, image, places, z_mm)
     left = residual_path(path)
     if left.is_file():
-        figures["residual"] = Drawn(
-            "What the particles leave of the image: red is light that none explains, blue is too much light.",
-            partial(of_particles.residual_figure, read_image(left).astype(np.float64)),
-        )
+        figures["residual"] = partial(of_points.residual_figure, read_image(left).astype(np.float64))
     if len(z_mm):
-        figures["depths"] = Drawn(
-            "By depth: how many particles, their light, and the standard deviations of their places.",
-            partial(of_particles.depths_figure, z_mm, arrays["intensity"], arrays["covariance_mm2"]),
-        )
-        figures["chi2"] = Drawn(
-            "How well the particles explain the light about them: chi2 is about 1 where they explain all of it.",
-            partial(of_particles.chi2_figure, arrays["chi2"]),
-        )
+        spread = arrays["covariance_mm2"]
+        figures["depths"] = partial(of_points.depths_figure, z_mm, arrays["intensity"], spread)
+        figures["chi2"] = partial(of_points.chi2_figure, arrays["chi2"])
     return figures
 
 
-def _of_tracks(path: Path) -> dict[str, Drawn]:
+def _of_tracks(path: Path) -> Figures:
     tracks = read_points(path, TRACKS_FORMAT)
     arrays = tracks.arrays
-    lines, stretch = of_tracks.displacement_lines(tracks.position_mm, arrays["displacement_mm"])
-    words = f"{len(lines)} displacements, drawn {written(stretch)} times as long"
+    lines, stretch = of_points.displacement_lines(tracks.position_mm, arrays["displacement_mm"])
+    longer = f"drawn {written(stretch)} times as long"
+    caption = f"The displacements in space, coloured by speed; they are {longer} as they are."
     speeds = np.linalg.norm(arrays["velocity"], axis=1)
-    figures = {
-        "space": Drawn(
-            f"The displacements in space, coloured by speed; they are drawn {written(stretch)} times as long as they "
-            "are.",
-            partial(of_tracks.space_figure, lines, speeds, words),
-        )
-    }
-    return figures | _of_all_tracks(tracks)
+    space = partial(of_points.space_figure, lines, speeds, f"{len(lines)} displacements, {longer}")
+    return {"space": Drawn(caption, space)} | _of_all_tracks(tracks)
 
 
-def _of_trajectories(path: Path) -> dict[str, Drawn]:
+def _of_trajectories(path: Path) -> Figures:
     tracks = read_points(path, TRAJECTORIES_FORMAT)
     track = tracks.arrays["track"]
-    lines = of_tracks.trajectory_lines(tracks.position_mm, track)
-    speeds = of_tracks.trajectory_lines(np.linalg.norm(tracks.arrays["velocity"], axis=1), track)
+    lines = of_points.trajectory_lines(tracks.position_mm, track)
+    speeds = of_points.trajectory_lines(np.linalg.norm(tracks.arrays["velocity"], axis=1), track)
     means = np.array([float(each.mean()) for each in speeds])
-    figures = {
-        "space": Drawn(
-            "The trajectories in space, coloured by mean speed.",
-            partial(of_tracks.space_figure, lines, means, f"{len(lines)} trajectories"),
-        ),
-        "lengths": Drawn("How many frames the trajectories span.", partial(of_tracks.lengths_figure, track)),
+    figures: Figures = {
+        "space": partial(of_points.space_figure, lines, means, f"{len(lines)} trajectories"),
+        "lengths": partial(of_points.lengths_figure, track),
     }
     return figures | _of_all_tracks(tracks)
 
 
-def _of_all_tracks(tracks: Points) -> dict[str, Drawn]:
+def _of_all_tracks(tracks: Points) -> Figures:
     """Return the figures that tracks of two frames and of a sequence have in common."""
     arrays = tracks.arrays
-    figures = {
-        "velocities": Drawn("The velocity components.", partial(of_tracks.velocities_figure, arrays["velocity"])),
-    }
+    figures: Figures = {"velocities": partial(of_points.velocities_figure, arrays["velocity"])}
     if np.isfinite(arrays["link_probability"]).any():
-        figures["links"] = Drawn(
-            "How probable the links are, and how many wrong ones to expect.",
-            partial(of_tracks.links_figure, arrays["link_probability"]),
-        )
+        figures["links"] = partial(of_points.links_figure, arrays["link_probability"])
     if len(tracks.position_mm):
-        figures["sigma"] = Drawn(
-            "Stated standard deviations of the velocity components by depth, medians.",
-            partial(of_tracks.sigma_figure, tracks.position_mm[:, 2], arrays["velocity_sigma"]),
-        )
+        figures["sigma"] = partial(of_points.sigma_figure, tracks.position_mm[:, 2], arrays["velocity_sigma"])
     return figures
 
 
-def _of_volume(path: Path) -> dict[str, Drawn]:
+def _of_volume(path: Path) -> Figures:
     volume = vtkhdf.open_volume(path)
     return {
-        "projections": Drawn(
-            "The brightest voxel along each line of sight, in the three directions, on one scale.",
-            partial(of_volume.projections_figure, volume.array, volume.grid),
-        ),
-        "depths": Drawn(
-            "The mean intensity of each plane by depth.", partial(of_volume.depths_figure, volume.array, volume.grid)
-        ),
+        "projections": partial(of_vectors.projections_figure, volume.array, volume.grid),
+        "depths": partial(of_vectors.depths_figure, volume.array, volume.grid),
     }
 
 
-def _of_calibration(path: Path, white: Path | None) -> dict[str, Drawn]:
+def _of_calibration(path: Path, white: Path | None) -> Figures:
     calibration = read_calibration(path)
-    figures = {
-        "summary": Drawn(
-            "How far the lens images lie off the lattice, what pixels pass, and where the board was found.",
-            partial(of_calibration.summary_figure, calibration),
-        )
-    }
+    figures: Figures = {"summary": partial(of_calibration.summary_figure, calibration)}
     if white is not None:
         image = read_image(white, calibration.image_shape)
-        figures["lattice"] = Drawn(
-            "The lattice on the white image, in the middle and in two corners.",
-            partial(of_calibration.calibration_figure, calibration, image),
-        )
+        figures["lattice"] = partial(of_calibration.calibration_figure, calibration, image)
     return figures
 
 
-def _of_weights(path: Path) -> dict[str, Drawn]:
+def _of_weights(path: Path) -> Figures:
     content = open_weights(path)
     nx, ny, nz = content.weights.grid.shape_xyz
-    return {
-        "column": Drawn(
-            "The pixels that the middle voxel lights: its point-spread function.",
-            partial(column_of, content, (nx // 2, ny // 2, nz // 2)),
-        ),
-        "light": Drawn(
-            "How much of a voxel's light meets the sensor, by depth: on the axis, half-way out, and in a corner.",
-            partial(_light_of, content),
-        ),
-    }
+    middle = partial(column_of, content, (nx // 2, ny // 2, nz // 2))
+    return {"column": middle, "light": partial(_light_of, content)}
 
 
 def column_of(content: WeightsFile, voxel: tuple[int, int, int]) -> Figure:
-    """Return the figure of the pixels that a voxel (ix, iy, iz) lights.
-
-    Raises
-    ------
-    InputError : it lights none
-    """
+    """Return the figure of the pixels that a voxel (ix, iy, iz) lights (InputError: it lights none)."""
     ix, iy, iz = voxel
     rows, columns, shares = content.weights.column(iz, iy, ix)
     if not shares.size:
@@ -285,7 +233,7 @@ def column_of(content: WeightsFile, voxel: tuple[int, int, int]) -> Figure:
     grid = content.reference.grid_from_focal_point(content.weights.grid)
     place = ", ".join(written(axis, 4) for axis in grid.voxel_to_mm(np.array(voxel, dtype=np.float64)))
     title = f"voxel {ix}, {iy}, {iz} at ({place}) mm: {shares.size} pixels, sum {shares.sum():.4f}"
-    return of_weights.column_figure((rows, columns), shares, content.camera.pixel_mm, title)
+    return of_vectors.column_figure((rows, columns), shares, content.camera.pixel_mm, title)
 
 
 def _light_of(content: WeightsFile) -> Figure:
@@ -297,17 +245,17 @@ def _light_of(content: WeightsFile) -> Figure:
         name: np.array([float(content.weights.column(int(iz), iy, ix)[2].sum()) for iz in planes])
         for name, (ix, iy) in places.items()
     }
-    return of_weights.light_figure(grid.axis_mm(2)[planes], sums)
+    return of_vectors.light_figure(grid.axis_mm(2)[planes], sums)
 
 
-READERS: dict[str, Callable[[Path], dict[str, Drawn]]] = {
+READERS: dict[str, Callable[[Path], Figures]] = {
     vtkhdf.VECTORS_FORMAT: _of_vectors,
     vtkhdf.VOLUME_FORMAT: _of_volume,
     TRACKS_FORMAT: _of_tracks,
     TRAJECTORIES_FORMAT: _of_trajectories,
     weights_file.FORMAT: _of_weights,
 }
-ON_IMAGES: dict[str, Callable[[Path, Path | None], dict[str, Drawn]]] = {
+ON_IMAGES: dict[str, Callable[[Path, Path | None], Figures]] = {
     PARTICLES_FORMAT: _of_particles,
     calibration_file.FORMAT: _of_calibration,
 }
@@ -341,13 +289,13 @@ def figures_of(path: Path, raw: Path | None = None) -> dict[str, Drawn]:
     UsageError : there is no figure on an image in it
     """
     of_format = format_of(path)
-    if of_format in ON_IMAGES:
-        return ON_IMAGES[of_format](path, raw)
-    if of_format not in READERS:
+    if of_format not in READERS and of_format not in ON_IMAGES:
         raise InputError(f"{path}: {of_format} has no figures, only {', '.join(sorted({*READERS, *ON_IMAGES}))}")
-    if raw is not None:
+    if raw is not None and of_format not in ON_IMAGES:
         raise UsageError(f"--raw: figures of {of_format} show no image, only {' and '.join(ON_IMAGES)} do")
-    return READERS[of_format](path)
+    found = ON_IMAGES[of_format](path, raw) if of_format in ON_IMAGES else READERS[of_format](path)
+    captions = CAPTIONS[of_format]
+    return {name: each if isinstance(each, Drawn) else Drawn(captions[name], each) for name, each in found.items()}
 
 
 def plot(
@@ -367,7 +315,10 @@ def plot(
     if unknown:
         raise UsageError(f"--only {unknown[0]}: {file} has the figures {', '.join(figures)}")
     chosen = {name: drawn for name, drawn in figures.items() if not options.only or name in options.only}
-    targets = _targets(output, list(chosen))
+    # A PDF holds all, a PNG one; of several each has its name at the end.
+    targets = dict.fromkeys(chosen, output)
+    if output.suffix != ".pdf" and len(chosen) > 1:
+        targets = {name: output.with_name(f"{output.stem}_{name}{output.suffix}") for name in chosen}
     for target in targets.values():
         ensure_writable(target, overwrite, given(file=file, raw=options.raw).values())
     with console.progress(len(chosen), "figures") as advance:
@@ -378,13 +329,6 @@ def plot(
             for target, figure in zip(targets.values(), drawn, strict=True):
                 write_picture(target, figure, overwrite)
     return {"figures": list(chosen), "files": [str(target) for target in dict.fromkeys(targets.values())]}
-
-
-def _targets(output: Path, names: list[str]) -> dict[str, Path]:
-    """Return where each figure goes: a PDF holds all, a PNG one; of several each has its name at the end."""
-    if output.suffix == ".pdf" or len(names) == 1:
-        return dict.fromkeys(names, output)
-    return {name: output.with_name(f"{output.stem}_{name}{output.suffix}") for name in names}
 
 
 def _drawn(figures: Mapping[str, Drawn], advance: Callable[[int], None]) -> Iterator[Figure]:

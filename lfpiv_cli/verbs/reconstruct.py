@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -20,15 +20,14 @@ from lfpiv_cli.files.atomic import ensure_writable, folder_of
 from lfpiv_cli.files.batch import Target, frames_of, output_paths
 from lfpiv_cli.files.config import carried_config
 from lfpiv_cli.files.hdf5 import unpacked_bytes
-from lfpiv_cli.files.inputs import ensure_room, given
+from lfpiv_cli.files.inputs import ensure_room
 from lfpiv_cli.files.pairing import Pairs
 from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, write_points
-from lfpiv_cli.files.provenance import Gone, also_used_as, record, with_warnings
+from lfpiv_cli.files.provenance import Gone, also_used_as, record, sha256, with_warnings
 from lfpiv_cli.files.vtkhdf import Volume
 from lfpiv_cli.files.weights_file import WeightsFile, read_weights_record
 from lfpiv_cli.names import Start
-from lfpiv_cli.notice import Notice, warn_of
-from lfpiv_cli.particles.search import Particles
+from lfpiv_cli.notice import Notice, warn_of, written
 from lfpiv_cli.reconstruction.images import Image, as_if_lit, filled, light
 from lfpiv_cli.reconstruction.registry import SolverName
 from lfpiv_cli.reconstruction.solvers import reconstruct as solve
@@ -38,25 +37,24 @@ from lfpiv_cli.verbs.frames import (
     IMAGE,
     STILL,
     Ahead,
-    Background,
     Bench,
+    ImageOptions,
     Progress,
-    Read,
     bench_of,
-    beside_frames,
     check_frame,
     frame_notices,
     given_picture,
     mask_of,
     other_frames,
     picture_for,
+    readable,
     reader,
     residual_path,
 )
-from lfpiv_cli.verbs.pairs import PairOptions, ensure_frames_alone, image_pairs, watched, work_as_they_come
+from lfpiv_cli.verbs.pairs import PairOptions, image_pairs, watched, work_as_they_come
 from lfpiv_cli.verbs.particles import Finder, Prepared
 from lfpiv_cli.verbs.tracers import TracerSize, light_notices, size_notices
-from lfpiv_cli.verbs.weights_cost import FLOAT_BYTES, columns_bytes, held_bytes, on_demand_told
+from lfpiv_cli.verbs.weights_cost import COLUMN_S, FLOAT_BYTES, columns_bytes, held_bytes
 
 
 def reconstruct(
@@ -123,21 +121,14 @@ def volume_of(
         operator = operator.for_image(as_if_lit(image, excluded))
     sums = bench.sums_without(operator, excluded)
     result = solve(operator, image, bench.settings.solver_settings(), sums=sums, progress=progress)
-    return Volume(
-        content.weights.to_world(result.volume),
-        content.reference.grid_from_focal_point(content.weights.grid),
-        content.reference,
-        attributes=content.reference.attributes()
-        | {
-            "residual": result.residual,
-            "excluded_pixels": int(np.count_nonzero(excluded)),
-            "support_voxels": result.support_voxels,
-        },
-        provenance=dict(provenance),
-    )
-
-
-# The particles of the frames of a batch: each frame by itself, or with the help of those beside it.
+    told = content.reference.attributes() | {
+        "residual": result.residual,
+        "excluded_pixels": int(np.count_nonzero(excluded)),
+        "support_voxels": result.support_voxels,
+    }
+    grid = content.reference.grid_from_focal_point(content.weights.grid)
+    array = content.weights.to_world(result.volume)
+    return Volume(array, grid, content.reference, attributes=told, provenance=dict(provenance))
 
 
 @dataclass(frozen=True)
@@ -154,15 +145,12 @@ class Outcome:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ReconstructOptions(PairOptions, BatchOptions):
+class ReconstructOptions(PairOptions, ImageOptions, BatchOptions):
     """What `reconstruct` is given besides weights and images.
 
     Attributes
     ----------
     solver, iterations, relaxation, accelerate, start : in place of the config's, see its section `reconstruction`
-    dark : image taken with the cap on; its hot and dead pixels are left out
-    background : image to subtract, or `minimum` or `mean` over the images, or as `minimum:15`
-    mask : image that is black where pixels are left out, or `still`: where bright light does not move in the images
     residual : of particles, also write what they leave of each image
     """
 
@@ -171,9 +159,6 @@ class ReconstructOptions(PairOptions, BatchOptions):
     relaxation: float | None = None
     accelerate: bool | None = None
     start: Start | None = None
-    dark: Path | None = None
-    background: str | None = None
-    mask: str | Path | None = None
     residual: bool = True
 
 
@@ -188,24 +173,26 @@ def reconstruct_files(
     *,
     overwrite: bool = False,
     console: Console = CONSOLE,
-    pairs: Pairs | None = None,
-    prepared: Prepared | None = None,
-    order: Sequence[int] | None = None,
 ) -> dict[str, Any]:
-    """Reconstruct the volume behind each image, or find its particles.
-
-    `pairs` and `prepared`, where these are known already; `order`, where only some frames are to be made.
-    """
+    """Reconstruct the volume behind each image, or find its particles."""
     if options.watch:
         settings = carried_config(read_weights_record(weights), weights).overridden_by("reconstruction", options)
-        ensure_frames_alone(settings, options.background, options.mask)
+        refused = None
+        if options.level.kind is not None:
+            refused = f"--background {options.background} is"
+        elif options.mask == STILL:
+            refused = f"--mask {STILL} is"
+        elif settings.reconstruction.solver == "particles":
+            refused = "the tracers' size, which --solver particles needs, is"
+        if refused is not None:
+            raise UsageError(f"--watch: {refused} made from all frames, some of which have not come yet; wait for them")
         groups = watched(images, "images", options, console)
         with folder_of(output / weights.name):
             batch, worked = work_as_they_come(
                 lambda group: Reconstruction(weights, group, output, options, overwrite), groups, options, console
             )
     else:
-        batch = Reconstruction(weights, images, output, options, overwrite, pairs, prepared, order)
+        batch = Reconstruction(weights, images, output, options, overwrite)
         if options.dry_run:
             return dry_run(batch, options, console)
         worked = work_through(batch, options, console)
@@ -244,6 +231,7 @@ class Reconstruction(Batch[Outcome]):
     ) -> None:
         """Take the arguments of `reconstruct`; see which frames there are, and read no image.
 
+        `pairs` and `prepared`, where these are known already; `order`, where only some frames are to be made;
         `weights_to_come`, where the weights are to carry another record before anything is made.
 
         Raises
@@ -253,9 +241,7 @@ class Reconstruction(Batch[Outcome]):
         self._options, self.overwrite, self._prepared = options, overwrite, prepared or Prepared()
         # What is complete is skipped: in the place of what is made there is nothing, or something broken.
         self._replace = overwrite or options.resume
-        self._level = level = Background.parse(options.background)
-        mask_file = None if options.mask is None or options.mask == STILL else Path(options.mask)
-        self._common = given(weights=weights, dark=options.dark, background=level.path, mask=mask_file)
+        self._common = options.files(weights)
         self.inputs = [*self._common.values(), *images]
         self._frames = frames = frames_of(images, options.keep_going)
         if pairs is None and options.are_told:
@@ -274,8 +260,8 @@ class Reconstruction(Batch[Outcome]):
         self._as_particles = solver == "particles"
         if self._beside is not None and not self._as_particles:
             raise UsageError(f"--pairing: {solver} takes each frame alone; --solver particles does not")
-        words = other_frames(level, frames, options.mask)
-        self._words = words if self._beside is None else beside_frames(words, frames, self._beside)
+        # Which other frames the background and mask of one are made from.
+        self._words = other_frames(options.level, frames, options.mask)
         self._resolved = self._settings.resolved()
         self.targets = [Target(path, partial(self._record, number)) for number, path in enumerate(self._paths)]
         with_residuals = self._as_particles and options.residual
@@ -300,25 +286,38 @@ class Reconstruction(Batch[Outcome]):
         """Open the weights, and prepare what all frames share."""
         options, settings, frames = self._options, self._settings, self._frames
         if self._as_particles and options.residual:
-            self._ensure_residuals(numbers, console)
+            for number in numbers:
+                ensure_writable(residual_path(self._paths[number]), self._replace)
+            coming = set(numbers)
+            complete = [path for number, path in enumerate(self._paths) if number not in coming and path.exists()]
+            if without := sum(not residual_path(path).exists() for path in complete):
+                console.say(f"{without} frames that are complete have no residual image; --overwrite makes both anew")
         if not numbers:
             return 0.0
         prepared, weights = self._prepared, self._common["weights"]
-        content = prepared.searchable(weights, settings) if self._as_particles else prepared.weights(weights)
-        if not self._as_particles and content.weights.on_demand:
-            console.say(on_demand_told(math.prod(content.weights.padded.shape)))
-        shape = content.image_shape
-        if not self._as_particles:
+        if self._as_particles:
+            content = prepared.searchable(weights, settings)
+        else:
+            content = prepared.weights(weights)
+            voxels = math.prod(content.weights.padded.shape)
+            if content.weights.on_demand:
+                console.say(
+                    f"columns are made on demand: up to {written(voxels * COLUMN_S / 60.0, 2)} minutes of a core for "
+                    f"each image, where all {written(voxels)} voxels can be lit"
+                )
             # The weights are in memory by now.
-            ensure_room(held_bytes(math.prod(content.weights.padded.shape), math.prod(shape)), self.label)
-        dark = image_files.read_reference(options.dark, shape) if options.dark else None
+            ensure_room(held_bytes(voxels, math.prod(content.image_shape)), self.label)
+        shape = content.image_shape
+        dark = options.dark_image(shape)
         pitch_px = float(content.camera.micro_image_lattice_px().pitch.max())
         mask = mask_of(options.mask, frames, shape, pitch_px, options.keep_going)
         bench = prepared.bench(content, settings, dark, mask)
-        read = reader(self._level, frames, shape, dark, options.keep_going)
+        read = reader(options.level, frames, shape, dark, options.keep_going)
         size, said = None, []
         if self._as_particles:
-            bench, size = particles.sized(bench, self._looked_at(bench, read))
+            # What cannot be read is told where its turn comes.
+            pictures = readable(read, range(len(frames)), keep_going=True)
+            bench, size = particles.sized(bench, (particles.frame_of(bench, *each) for each in pictures))
             said = size_notices(settings, size)
             console.warn(said)
         finder = Finder(bench, read, frames, self._beside, self._first_of, options.keep_going)
@@ -330,20 +329,37 @@ class Reconstruction(Batch[Outcome]):
 
     def make(self, number: int, work: Frames) -> Outcome:
         """Reconstruct a frame, or find its particles, and write them."""
-        ready, name, target = self._begun(), self.names[number], self.targets[number]
+        if self._ready is None:
+            raise RuntimeError("a batch begins before anything of it is made")
+        ready, bench, name, target = self._ready, self._ready.bench, self.names[number], self.targets[number]
         pictures = ready.ahead(number)
-        check_frame(ready.bench, pictures[0], str(self._frames[number].path))
+        check_frame(bench, pictures[0], str(self._frames[number].path))
         made = target.record
-        notices = file_notices(made, name) + frame_notices(ready.bench, *pictures, name)
+        notices = file_notices(made, name) + frame_notices(bench, *pictures, name)
         work.console.warn(notices)
         if ready.size is None:
             made = with_warnings(made, notices)
-            return _make_volume(ready.bench, target.path, made, pictures, self._replace, work.advance)
-        frame = particles.frame_of(ready.bench, *pictures)
+            volume = volume_of(bench, *pictures, made, work.advance)
+            array, grid, reference, told = volume.array, volume.grid, volume.reference, volume.attributes
+            vtkhdf.write_volume(
+                target.path, array, grid, reference, provenance=made, attributes=told, overwrite=self._replace
+            )
+            return Outcome(float(told["residual"][-1]), told["excluded_pixels"])
+        frame = particles.frame_of(bench, *pictures)
         found, alone = ready.finder.find(number, frame, work.advance)
         work.console.warn(alone)
         made = with_warnings(made, [*ready.said, *notices, *alone])
-        return self._write_particles(target.path, made, (frame, found, ready.size), work.console)
+        points = particles.points_of(bench, frame, found, ready.size, made)
+        of_light = light_notices(points, target.path.name)
+        work.console.warn(of_light)
+        if self._options.residual:
+            left = particles.what_is_left(frame, found)
+            # Made again whenever the particles are: an interrupted batch may have left one without them.
+            image_files.write_tiff(residual_path(target.path), left.astype(np.float32), overwrite=True)
+        points = replace(points, provenance=with_warnings(made, of_light))
+        write_points(target.path, PARTICLES_FORMAT, points, overwrite=self._replace)
+        told = points.attributes
+        return Outcome(told["residual"], told["excluded_pixels"], len(points.position_mm), ready.size)
 
     def summary(self, worked: Worked[Outcome]) -> dict[str, Any]:
         """Return what is told of the batch."""
@@ -368,55 +384,11 @@ class Reconstruction(Batch[Outcome]):
         if frame.fault is not None:
             raise InputError(frame.fault)
         command = f"reconstruct page {frame.page}{self._words(number)}"
+        for k in () if self._beside is None else self._beside[number]:
+            if (beside := self._frames[k]).fault is None:
+                command += f", beside page {beside.page}{self._words(k)} of SHA-256 {sha256(beside.path)}"
         inputs = {**self._common, "image": frame.path}
         return record(command, self._resolved, inputs, {"image": frame.time_s}, self._gone)
-
-    def _begun(self) -> _Ready:
-        if self._ready is None:
-            raise RuntimeError("a batch begins before anything of it is made")
-        return self._ready
-
-    def _looked_at(self, bench: Bench, read: Read) -> Iterator[particles.Frame]:
-        """Yield the frames that can be read."""
-        for number in range(len(self._frames)):
-            try:
-                pictures = read(number)
-            except InputError:
-                continue  # it is told where its turn comes
-            yield particles.frame_of(bench, *pictures)
-
-    def _write_particles(
-        self,
-        path: Path,
-        made: Mapping[str, Any],
-        result: tuple[particles.Frame, Particles, TracerSize],
-        console: Console,
-    ) -> Outcome:
-        """Write the particles found behind a frame and, where it is asked for, what they leave of it."""
-        frame, found, size = result
-        points = particles.points_of(self._begun().bench, frame, found, size, made)
-        notices = light_notices(points, path.name)
-        console.warn(notices)
-        if self._options.residual:
-            left = particles.what_is_left(frame, found)
-            # Made again whenever the particles are: an interrupted batch may have left one without them.
-            image_files.write_tiff(residual_path(path), left.astype(np.float32), overwrite=True)
-        told = replace(points, provenance=with_warnings(made, notices))
-        write_points(path, PARTICLES_FORMAT, told, overwrite=self._replace)
-        residual, excluded = points.attributes["residual"], points.attributes["excluded_pixels"]
-        return Outcome(residual, excluded, len(points.position_mm), size)
-
-    def _ensure_residuals(self, numbers: Sequence[int], console: Console) -> None:
-        """Refuse residual images that could not be written; say of how many frames that are complete there is none."""
-        for number in numbers:
-            ensure_writable(residual_path(self._paths[number]), self._replace)
-        coming = set(numbers)
-        without = sum(
-            number not in coming and path.exists() and not residual_path(path).exists()
-            for number, path in enumerate(self._paths)
-        )
-        if without:
-            console.say(f"{without} frames that are complete have no residual image; --overwrite makes both anew")
 
 
 def file_notices(made: Mapping[str, Any], name: str) -> list[Notice]:
@@ -426,26 +398,3 @@ def file_notices(made: Mapping[str, Any], name: str) -> list[Notice]:
         return []
     text = f"the file is also the {other}: it shows no tracers"
     return [Notice("frame-given-before", name, text, "leave it out of the images, or correct the other")]
-
-
-def _make_volume(
-    bench: Bench,
-    path: Path,
-    made: Mapping[str, Any],
-    pictures: tuple[Image, Image],
-    overwrite: bool,
-    advance: Progress,
-) -> Outcome:
-    """Reconstruct and write the volume of a frame."""
-    volume = volume_of(bench, *pictures, made, advance)
-    told = volume.attributes
-    vtkhdf.write_volume(
-        path,
-        volume.array,
-        volume.grid,
-        volume.reference,
-        provenance=made,
-        attributes=told,
-        overwrite=overwrite,
-    )
-    return Outcome(float(told["residual"][-1]), told["excluded_pixels"])

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -33,17 +33,6 @@ from lfpiv_cli.self_calibration.scene_refinement import (
     SceneRefinement,
     refine_scene,
 )
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-
-class Refined(NamedTuple):
-    """What was found, the calibration with it, and what draws it."""
-
-    found: Refinement | SceneRefinement
-    calibration: Calibration
-    draw: Callable[[], Figure]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,19 +84,25 @@ def refine_calibration(
     frames, shape = frames_of(images), settings.image_shape()
     dark_image, empty = (image_files.read_reference(path, shape) if path else None for path in (dark, background))
     lit = [light(image_files.read_page(frame.path, frame.page, shape), dark_image, empty) for frame in frames]
+    found: Refinement | SceneRefinement
     if scene is None:
-        found, mended, draw = _walls(settings, lit, before, console)
+        found = _walls(settings, lit, before, console)
+        mended = found.applied(before)
     else:
-        found, mended, draw = _scene(told, settings, scene, lit, before, console)
+        found = _scene(settings, scene, lit, before, console)
+        mended = found.applied(before, told.scene_fingerprint())
     if output:
         made_by = record("refine-calibration", told.resolved(), inputs)
         write_calibration(output, mended, made_by, overwrite)
     if picture:
-        write_picture(picture, draw(), overwrite)
+        from lfpiv_cli.pictures.calibration import round_wall_figure, walls_figure
+
+        drawn = walls_figure(found) if isinstance(found, Refinement) else round_wall_figure(found)
+        write_picture(picture, drawn, overwrite)
     return found.summary()
 
 
-def _walls(settings: Config, lit: Sequence[Image], before: Calibration, console: Console) -> Refined:
+def _walls(settings: Config, lit: Sequence[Image], before: Calibration, console: Console) -> Refinement:
     """Return what tracers tell of a channel."""
     if settings.channel is None:
         raise ConfigError(f"{settings.source}: channel: is missing")
@@ -115,26 +110,14 @@ def _walls(settings: Config, lit: Sequence[Image], before: Calibration, console:
     chosen = settings.reconstruction
     flow = ChannelFlow(settings.grid(), settings.channel.width_mm, chosen.particle_diameter_mm, chosen.wave_light())
     with console.progress(len(lit) * STEPS + 1, "refine") as advance:
-        found = refine(
-            lit,
-            before,
-            settings.camera_model(),
-            ObjectSpace(settings.media_model(), window, "exact"),
-            flow,
-            advance,
+        return refine(
+            lit, before, settings.camera_model(), ObjectSpace(settings.media_model(), window, "exact"), flow, advance
         )
-
-    def draw() -> Figure:
-        from lfpiv_cli.pictures.calibration import walls_figure
-
-        return walls_figure(found)
-
-    return Refined(found, found.applied(before), draw)
 
 
 def _scene(
-    told: Config, settings: Config, scene: CurvedSpace, lit: Sequence[Image], before: Calibration, console: Console
-) -> Refined:
+    settings: Config, scene: CurvedSpace, lit: Sequence[Image], before: Calibration, console: Console
+) -> SceneRefinement:
     """Return what tracers tell of the place of a scene, from where config and calibration have it."""
     with console.progress(STEPS_OF_FIRST + (len(lit) - 1) * STEPS_OF_OTHER, "refine") as advance:
         found = refine_scene(
@@ -147,22 +130,12 @@ def _scene(
             advance,
         )
     if not found.agree:
-        console.warn([disagreement_notice(found)])
-
-    def draw() -> Figure:
-        from lfpiv_cli.pictures.calibration import round_wall_figure
-
-        return round_wall_figure(found)
-
-    return Refined(found, found.applied(before, told.scene_fingerprint()), draw)
-
-
-def disagreement_notice(found: SceneRefinement) -> Notice:
-    """Return that the images of the tracers tell of another scene than the wall that they end at."""
-    apart = np.abs(found.by_wall - found.nuisances.scene)[:2].max()
-    text = (
-        f"the tracers' images tell of a pipe whose axis lies {apart:.3f} mm beside that of the wall they end at, more "
-        "than chance explains; the wall is believed"
-    )
-    remedy = "check radii and refractive indices of the scene"
-    return Notice("scene-contradicts", "scene", text, remedy, found.disagreement, f"at most {AGREEING_CHI2:g}")
+        apart = np.abs(found.by_wall - found.nuisances.scene)[:2].max()
+        text = (
+            f"the tracers' images tell of a pipe whose axis lies {apart:.3f} mm beside that of the wall they end at, "
+            "more than chance explains; the wall is believed"
+        )
+        remedy = "check radii and refractive indices of the scene"
+        expected = f"at most {AGREEING_CHI2:g}"
+        console.warn([Notice("scene-contradicts", "scene", text, remedy, found.disagreement, expected)])
+    return found

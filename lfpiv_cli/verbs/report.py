@@ -44,20 +44,8 @@ from lfpiv_cli.files.vtkhdf import VECTORS_FORMAT, VOLUME_FORMAT, open_vectors, 
 from lfpiv_cli.flow.field import MASKED, REJECTED, VALID, VectorField
 from lfpiv_cli.notice import written
 from lfpiv_cli.pictures.points import MOST_LINES, has_views, lines_view, trajectory_lines
-from lfpiv_cli.verbs.checks import quality_of
+from lfpiv_cli.verbs import checks
 from lfpiv_cli.verbs.plot import figures_of
-from lfpiv_cli.verbs.verdicts import (
-    CALIBRATES,
-    OF_IMAGES,
-    Part,
-    Reason,
-    Verdict,
-    of_two_ways,
-    of_vectors,
-    of_warnings,
-    verb_of,
-    verdicts,
-)
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -144,8 +132,30 @@ def report(
     ensure_pages()
     ensure_drawing()
     contents = contents_of(folder)
-    fields = _best_first(contents)
-    judged = _verdicts(contents, fields)
+    fields = {path: open_vectors(path) for path in contents.of("vectors")[:LONGEST_TABLE]}
+    # Those with the smallest stated errors first.
+    fields = dict(sorted(fields.items(), key=lambda item: _sigma(item[1])))
+    reasons = [*checks.of_warnings(contents.all_records), *_of_all_vectors(contents, fields)]
+    made_by = {checks.verb_of(record) for record in contents.all_records.values()}
+    counted: list[tuple[checks.Part, bool, str]] = [
+        (
+            "calibration",
+            not made_by.isdisjoint(checks.CALIBRATES),
+            "no calibration: lengths are as the data sheet has them",
+        ),
+        ("images", not made_by.isdisjoint(checks.OF_IMAGES), "no volumes and no particles"),
+        ("vectors", bool(contents.of("vectors") or contents.of("tracks")), "no vectors and no tracks"),
+    ]
+    reasons += [checks.Reason(part, "look", text) for part, there, text in counted if not there]
+    judged = checks.verdicts(reasons, [part for part, _, _ in counted])
+    words = {each.part: each.word for each in judged}
+    advice = "Nothing speaks against these vectors, as far as images and vectors tell it themselves."
+    if "no" in words.values():
+        advice = "Do not use these vectors before what is said below is mended."
+    elif "look" in words.values():
+        advice = "Look at what is said below before you use these vectors."
+    rows = tuple((each.part, each.word, "; ".join(each.reasons) or "nothing speaks against it") for each in judged)
+    verdict = Table("Verdict: good, look (at the reasons), or no", ("part", "verdict", "reasons"), rows)
     with TemporaryDirectory() as pictures:
         drawer = Drawer(contents, Path(pictures), {sha256(path): path for path in options.raw})
         sections = [*_chain(contents, fields, drawer), *_records(contents)]
@@ -153,9 +163,7 @@ def report(
             console.say('the page has no view to turn: that needs plotly, pip install "lfpiv[report]"')
         made = contents.last
         foot = f"Made by lfpiv {made.get('version')} from the files in {folder.resolve().name}."
-        page = Page(TITLE, (_told(judged),), (_verdict_table(judged),), tuple(sections), foot)
-        write_pages(page, [output], overwrite)
-    words = {each.part: each.word for each in judged}
+        write_pages(Page(TITLE, (advice,), (verdict,), tuple(sections), foot), [output], overwrite)
     return {"files": len(contents.records), "pictures": drawer.count, "verdict": words}
 
 
@@ -186,21 +194,18 @@ def contents_of(folder: Path) -> Contents:
     order = list(dict.fromkeys(KINDS.values()))
     in_order = {kind: files[kind] for kind in order if kind in files}
     names = [path.relative_to(folder).as_posix() for kind in in_order.values() for path in kind]
-    return Contents(folder, in_order, {name: records[name] for name in names}, _earlier(records.values()))
-
-
-def _earlier(records: Iterable[Mapping[str, Any]]) -> dict[str, Mapping[str, Any]]:
-    """Return the records of what files were made from, by name and hash, but for those that are among these files'."""
-    there = [{name: value for name, value in made.items() if name != "made_from"} for made in records]
-    behind = {digest: made for each in records for digest, made in each.get("made_from", {}).items()}
+    # What files were made from, by name and hash, but for what is among these files.
+    there = [{name: value for name, value in made.items() if name != "made_from"} for made in records.values()]
+    behind = {digest: made for each in records.values() for digest, made in each.get("made_from", {}).items()}
     inputs = [given for made in (*there, *behind.values()) for given in made.get("inputs", {}).values()]
-    names = {given["sha256"]: given["name"] for given in inputs}
+    called = {given["sha256"]: given["name"] for given in inputs}
     known = {json.dumps(made, sort_keys=True) for made in there}
-    return {
-        f"{names.get(digest, '')} ({digest[:8]}, not in the folder)": made
+    earlier = {
+        f"{called.get(digest, '')} ({digest[:8]}, not in the folder)": made
         for digest, made in behind.items()
         if json.dumps(made, sort_keys=True) not in known
     }
+    return Contents(folder, in_order, {name: records[name] for name in names}, earlier)
 
 
 @dataclass
@@ -228,60 +233,27 @@ class Drawer:
         return Picture(target, caption)
 
 
-def _verdicts(contents: Contents, fields: Fields) -> list[Verdict]:
-    """Return what is thought of each part of the chain."""
-    reasons = [*of_warnings(contents.all_records), *_of_all_vectors(contents, fields)]
-    made = {verb_of(record) for record in contents.all_records.values()}
-    counted: list[tuple[Part, bool, str]] = [
-        ("calibration", not made.isdisjoint(CALIBRATES), "no calibration: lengths are as the data sheet has them"),
-        ("images", not made.isdisjoint(OF_IMAGES), "no volumes and no particles"),
-        ("vectors", bool(contents.of("vectors") or contents.of("tracks")), "no vectors and no tracks"),
-    ]
-    reasons += [Reason(part, "look", text) for part, there, text in counted if not there]
-    return verdicts(reasons, [part for part, _, _ in counted])
-
-
-def _of_all_vectors(contents: Contents, fields: Fields) -> list[Reason]:
+def _of_all_vectors(contents: Contents, fields: Fields) -> list[checks.Reason]:
     """Return what vectors say of themselves and of each other.
 
     What speaks against vectors that better ones by another command stand beside is told, and not counted.
     """
     by_command: dict[str, list[Path]] = {}
     for path in fields:
-        by_command.setdefault(verb_of(contents.record(path)), []).append(path)
-    reasons: list[Reason] = []
+        by_command.setdefault(checks.verb_of(contents.record(path)), []).append(path)
+    reasons: list[checks.Reason] = []
     for number, paths in enumerate(by_command.values()):
-        found = [each for path in paths for each in of_vectors(fields[path], path.name)]
+        found = [each for path in paths for each in checks.of_vectors(fields[path], path.name)]
         against = [each for each in found if each.word != "good"]
         reasons += [replace(each, word="good") if number else each for each in against[:MOST_FIELDS]]
         if len(against) > MOST_FIELDS:
             text = f"{len(against) - MOST_FIELDS} more reasons like these in other files"
-            reasons.append(Reason("vectors", "good" if number else "look", text))
+            reasons.append(checks.Reason("vectors", "good" if number else "look", text))
         reasons += [each for each in found if each.word == "good"][:1]
     if all(len(paths) == 1 for paths in by_command.values()):
         for one, other in combinations(fields, 2):
-            reasons += of_two_ways(fields[one], fields[other], (one.name, other.name))
+            reasons += checks.of_two_ways(fields[one], fields[other], (one.name, other.name))
     return reasons
-
-
-def _best_first(contents: Contents) -> Fields:
-    """Return the vectors of each file, those with the smallest stated errors first."""
-    fields = {path: open_vectors(path) for path in contents.of("vectors")[:LONGEST_TABLE]}
-    return dict(sorted(fields.items(), key=lambda item: _sigma(item[1])))
-
-
-def _told(judged: Sequence[Verdict]) -> str:
-    words = {each.word for each in judged}
-    if "no" in words:
-        return "Do not use these vectors before what is said below is mended."
-    if "look" in words:
-        return "Look at what is said below before you use these vectors."
-    return "Nothing speaks against these vectors, as far as images and vectors tell it themselves."
-
-
-def _verdict_table(judged: Sequence[Verdict]) -> Table:
-    rows = tuple((each.part, each.word, "; ".join(each.reasons) or "nothing speaks against it") for each in judged)
-    return Table("Verdict: good, look (at the reasons), or no", ("part", "verdict", "reasons"), rows)
 
 
 def _chain(contents: Contents, fields: Fields, drawer: Drawer) -> Iterable[Section]:
@@ -311,7 +283,10 @@ def _chain(contents: Contents, fields: Fields, drawer: Drawer) -> Iterable[Secti
         summary = read_calibration(path).summary()
         rows = tuple((name, _cell(value)) for name, value in summary.items() if value is not None)
         table = Table("What the white image and the board show", ("figure", "value"), rows)
-        pictures = [*_beside(path), *drawer.pictures(path, "white")]
+        pictures = drawer.pictures(path, "white")
+        # That `calibrate-snapshot --picture` has put beside it.
+        if (beside := path.with_suffix(".png")).is_file():
+            pictures = [Picture(beside, "lens images and board, as found"), *pictures]
         yield Section("Calibration", "calibration", (), (table,), tuple(pictures))
     for path in contents.of("weights")[:1]:
         yield Section("Weights", "weights", pictures=tuple(drawer.pictures(path)))
@@ -319,14 +294,8 @@ def _chain(contents: Contents, fields: Fields, drawer: Drawer) -> Iterable[Secti
 
 def _sigma(field: VectorField) -> float:
     """Return the size of the usual stated error of vectors, mm; infinite where none is stated."""
-    sigma = quality_of(field).summary()["uncertainty_voxel_median"]
+    sigma = checks.quality_of(field).summary()["uncertainty_voxel_median"]
     return float("inf") if sigma is None else float(np.linalg.norm(np.multiply(sigma, field.voxel_mm)))
-
-
-def _beside(calibration: Path) -> list[Picture]:
-    """Return the picture that `calibrate-snapshot --picture` has put beside a calibration."""
-    picture = calibration.with_suffix(".png")
-    return [Picture(picture, "lens images and board, as found")] if picture.is_file() else []
 
 
 Row = dict[str, str]
@@ -370,7 +339,7 @@ def _with_error(told: Mapping[str, Any], name: str, unit: str) -> str:
 
 
 def _field_row(vectors: VectorField) -> Row:
-    quality, there, used = quality_of(vectors), vectors.flag < REJECTED, vectors.flag < MASKED
+    quality, there, used = checks.quality_of(vectors), vectors.flag < REJECTED, vectors.flag < MASKED
     moved = vectors.displacement_voxel[there]
     return {
         "vectors": str(quality.used),

@@ -4,84 +4,61 @@ In the output folder: `calibration.h5`, `calibration.png`, `weights.h5`; by volu
 `vectors.vtkhdf`; by particles `particles/STEM.vtkhdf`, `tracks.vtkhdf` and `tracks_grid.vtkhdf`; of both together
 `combined.vtkhdf`; of several pairs the folders `vectors`, `tracks` and `combined`. `run.json` says what was chosen,
 why, and what each step told; `report.html` shows all of it.
+
+What a run would make is known before anything is made. With weights at hand each batch tells of itself; before there
+are any, nothing else can be complete: frames and pairs are counted, and their files taken for as large as their arrays.
 """
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
-import json
+import math
+import shutil
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, cast
 
-import numpy as np
-
 from lfpiv_cli.console import CONSOLE, Console
-from lfpiv_cli.errors import ConfigError, InputError, OutputExistsError, PartialError, UsageError
+from lfpiv_cli.errors import ConfigError, InputError, LfpivError, OutputExistsError, PartialError, UsageError
 from lfpiv_cli.files import images as image_files
-from lfpiv_cli.files.atomic import ensure_writable, without_nan, write_text
-from lfpiv_cli.files.batch import Frame, frames_of, output_paths
+from lfpiv_cli.files.atomic import ensure_writable
+from lfpiv_cli.files.batch import Frame, frames_of, output_paths, pending
+from lfpiv_cli.files.calibration_file import read_calibration
 from lfpiv_cli.files.config import Config, load_config
 from lfpiv_cli.files.inputs import ensure_regular_file, split_part
 from lfpiv_cli.files.pages import ensure_drawing, ensure_pages
 from lfpiv_cli.files.pairing import Pairs
-from lfpiv_cli.files.provenance import sha256
-from lfpiv_cli.files.vtkhdf import open_vectors
-from lfpiv_cli.flow.field import REJECTED, VALID
+from lfpiv_cli.files.provenance import Gone, carried_record, sha256, without_warnings
 from lfpiv_cli.names import FlowMethod
 from lfpiv_cli.notice import written
-from lfpiv_cli.verbs import particles
-from lfpiv_cli.verbs.batches import ALL, Failure
+from lfpiv_cli.verbs import build_weights, calibrate, particles
+from lfpiv_cli.verbs.batches import ALL, AT_MOST, MB, RECORD_BYTES, Expected, Worked, dry_run, time_and_memory
+from lfpiv_cli.verbs.build_weights import plan_of
 from lfpiv_cli.verbs.calibrate import ensure_pictures
-from lfpiv_cli.verbs.checks import quality_of, quality_of_all
-from lfpiv_cli.verbs.follow import SEQUENCE_IS_WHOLE
+from lfpiv_cli.verbs.checks import figures_of
+from lfpiv_cli.verbs.correlate import field_bytes
+from lfpiv_cli.verbs.follow import SEQUENCE_IS_WHOLE, follow_particles
 from lfpiv_cli.verbs.following import SHORTEST, ensure_sequence
-from lfpiv_cli.verbs.frames import STILL, Background, mask_of, other_frames, read_frame, reader
+from lfpiv_cli.verbs.frames import mask_of, other_frames, read_frame, reader
 from lfpiv_cli.verbs.pairs import image_pairs
 from lfpiv_cli.verbs.particles import Prepared
 from lfpiv_cli.verbs.report import ReportOptions, report
-from lfpiv_cli.verbs.run_plan import planned, with_overwrite
-from lfpiv_cli.verbs.run_steps import Chain, RunOptions, Vectors
-from lfpiv_cli.verbs.steps import KEPT, MADE, RECORD, Steps, earlier_run
-from lfpiv_cli.verbs.weights_cost import ensure_volume_fits
-
-# What `run` tells of the vectors of each method, side by side.
-
-
-# A range of displacements leaves out so many percent at either end, where a few are false.
-LEFT_OUT_PERCENT = 5.0
-
-
-def figures_of(fields: Mapping[str, Sequence[Path]]) -> dict[str, dict[str, float | int | None]]:
-    """Return how many vectors each method gives, how good they are and what they range over: figures by method."""
-    by_method = {method: _figures_of(paths) for method, paths in fields.items() if paths}
-    names = next(iter(by_method.values()), {})
-    return {name: {method: figures[name] for method, figures in by_method.items()} for name in names}
-
-
-def _figures_of(paths: Sequence[Path]) -> dict[str, float | int | None]:
-    """Return the figures of a method's fields, which are read one after the other."""
-    qualities, displacements, valid = [], [], 0
-    for path in paths:
-        field = open_vectors(path)
-        qualities.append(quality_of(field))
-        displacements.append(field.displacement_voxel[field.flag < REJECTED])
-        valid += int(np.count_nonzero(field.flag == VALID))
-    quality, moved = quality_of_all(qualities), np.concatenate(displacements)
-    ends = LEFT_OUT_PERCENT, 100.0 - LEFT_OUT_PERCENT
-    low, high = np.percentile(moved, ends, axis=0) if len(moved) else np.full((2, 3), np.nan)
-    sigma = np.median(quality.sigma, axis=0) if len(quality.sigma) else np.full(3, np.nan)
-    told: dict[str, float | int | None] = {"vectors": quality.vectors, "valid": valid}
-    for k, name in enumerate("uvw"):
-        told |= {
-            f"{name}_from_voxel": without_nan(low[k]),
-            f"{name}_to_voxel": without_nan(high[k]),
-            f"{name}_sigma_voxel": without_nan(sigma[k]),
-        }
-    return told
-
+from lfpiv_cli.verbs.run_steps import (
+    CALIBRATION,
+    MADE,
+    RECORD,
+    RESULTS,
+    WEIGHTS,
+    Chain,
+    RunOptions,
+    Steps,
+    Vectors,
+    earlier_run,
+)
+from lfpiv_cli.verbs.weights_cost import FLOAT_BYTES, Cost, cost_of, ensure_volume_fits
 
 REPORT = "report.html"
 
@@ -121,7 +98,7 @@ def run(
     chain = Chain(config, options, frames, pairs, steps, prepared, overwrite)
 
     def choose(weights: Path) -> Choice:
-        return _chosen(settings, options, lambda: _counted(settings, options, weights, frames, prepared, steps))
+        return _chosen(settings, options, lambda: _counted(settings, chain, weights))
 
     def methods(weights: Path) -> tuple[FlowMethod, ...]:
         return choose(weights).methods
@@ -136,12 +113,12 @@ def run(
 
 
 def _made(chain: Chain, choose: Callable[[Path], Choice], overwrite: bool) -> dict[str, Any]:
-    """Take all steps; return what is told of them."""
+    """Take all steps; return what is told of them (PartialError: something failed)."""
     steps, options, output = chain.steps, chain.options, chain.steps.output
     ensure_writable(output / RECORD, overwrite=True)
     weights = chain.weights()
     if not chain.share:
-        return _told_of_steps(steps)
+        return steps.summary()
     choice = choose(weights)
     steps.console.say(f"by {' and '.join(choice.methods)}: {choice.reason}")
     steps.told.update(choice.told())
@@ -157,59 +134,39 @@ def _made(chain: Chain, choose: Callable[[Path], Choice], overwrite: bool) -> di
             *options.white,
             *options.board,
         )
-        told |= {"verdict": _reported(raw, steps, overwrite).get("verdict"), "report": str(output / REPORT)}
+        page = output / REPORT
+        is_kept = page.exists() and not steps.count(MADE)
+
+        def make() -> dict[str, Any]:
+            # Of all that the folder holds, where a step has made anything.
+            if is_kept:
+                return {}
+            replacing = overwrite or bool(steps.earlier)
+            return report(output, page, ReportOptions(raw=raw), overwrite=replacing, console=steps.console)
+
+        told |= {"verdict": steps.take("report", [page], make).get("verdict"), "report": str(page)}
     steps.write(whole=True)
-    return _ensure_whole(told | _told_of_steps(steps), chain.failures, options.failures)
-
-
-def _told_of_steps(steps: Steps) -> dict[str, Any]:
-    """Return what is told of a run's steps."""
-    return {"steps_made": steps.count(MADE), "steps_kept": steps.count(KEPT), "folder": str(steps.output)}
-
-
-def _ensure_whole(told: dict[str, Any], failures: Sequence[Failure], listed: Path | None) -> dict[str, Any]:
-    """Return what is told of a run in which nothing failed; list what did, where it is asked for.
-
-    Raises
-    ------
-    PartialError : something did
-    """
+    told |= steps.summary()
     # By both methods a frame fails twice.
-    records = [asdict(failure) for failure in dict.fromkeys(failures)]
-    if listed is not None:
-        write_text(listed, json.dumps(records, indent=2, ensure_ascii=False) + "\n", overwrite=True)
-    if failures:
-        first = f"{failures[0].name}: {failures[0].error}"
-        raise PartialError(f"{len(records)} frames or pairs failed, the first {first}", told | {"failures": records})
+    worked = Worked[None](failures=list(dict.fromkeys(chain.failures)))
+    worked.list_failures(options.failures)
+    if worked.failures:
+        first, records = worked.failures[0], [asdict(failure) for failure in worked.failures]
+        text = f"{len(records)} frames or pairs failed, the first {first.name}: {first.error}"
+        raise PartialError(text, told | {"failures": records})
     return told
-
-
-def _reported(raw: Sequence[Path], steps: Steps, overwrite: bool) -> dict[str, Any]:
-    """Make the page of all that the folder holds, where a step has made anything; return what it tells."""
-    page = steps.output / REPORT
-    is_kept = page.exists() and not steps.count(MADE)
-
-    def make() -> dict[str, Any]:
-        if is_kept:
-            return {}
-        replacing = overwrite or bool(steps.earlier)
-        return report(steps.output, page, ReportOptions(raw=raw), overwrite=replacing, console=steps.console)
-
-    return steps.take("report", [page], make)
 
 
 def _ensure_possible(settings: Config, options: RunOptions) -> tuple[list[Frame], Pairs]:
     """Return the frames of the flow and their pairs, after all that can be known to be wrong has been asked for."""
     _ensure_settings(settings, options)
-    _ensure_methods(settings, options)
     ensure_drawing()
     if options.report:
         ensure_pages()
     ensure_pictures(len(options.white), len(options.board), len(options.depth_mm))
     for path in (*options.white, *options.board):
         ensure_regular_file(split_part(path)[0])
-    mask = None if options.mask in (None, STILL) else Path(options.mask)
-    for path in filter(None, (options.dark, Background.parse(options.background).path, mask)):
+    for path in filter(None, (options.dark, options.level.path, options.mask_file)):
         image_files.read_reference(path, settings.image_shape())
     frames = frames_of(options.images, options.keep_going)
     if options.follow:
@@ -247,40 +204,27 @@ def _first_readable(frames: Sequence[Frame], shape: tuple[int, int], keep_going:
     raise InputError("no images were given")
 
 
-def _tell_times(images: Sequence[Path], keep_going: bool) -> bool:
-    """Return whether the recordings of the frames say when each was taken, of those that can be read.
-
-    Raises
-    ------
-    InputError : one cannot be read, and the others are not to go on
-    """
-    told = []
-    for path in images:
-        try:
-            told.append(image_files.frames(path).time_s is not None)
-        except InputError:
-            if not keep_going:
-                raise
-    return bool(told) and all(told)
-
-
 def _ensure_settings(settings: Config, options: RunOptions) -> None:
-    """Raise where the config lacks what a later step needs."""
-    is_stated = options.dt_s is not None or settings.correlation.dt_s is not None
-    if not is_stated and not _tell_times(options.images, options.keep_going):
-        raise ConfigError(
-            f"{settings.source}: correlation.dt_s: is missing, and velocities need it; give it there, or --dt-s"
-        )
+    """Raise where the config lacks what a later step needs, or contradicts the methods that are asked for."""
+    if options.dt_s is None and settings.correlation.dt_s is None:
+        # Whether recordings say when each frame was taken, those that can be read.
+        told = []
+        for path in options.images:
+            try:
+                told.append(image_files.frames(path).time_s is not None)
+            except InputError:
+                if not options.keep_going:
+                    raise
+        if not told or not all(told):
+            raise ConfigError(
+                f"{settings.source}: correlation.dt_s: is missing, and velocities need it; give it there, or --dt-s"
+            )
     settings.camera_model()
     settings.grid()
     if options.board:
         settings.rig()
     if settings.weights.method != "dlfc" and settings.channel is None:
         settings.object_space()
-
-
-def _ensure_methods(settings: Config, options: RunOptions) -> None:
-    """Raise where the methods that are asked for contradict the config or other options."""
     by_volumes, by_particles = (options.method in (method, "both") for method in ("volumes", "particles"))
     if options.combine and options.method != "both":
         raise UsageError("--combine needs --method both")
@@ -320,31 +264,166 @@ def _chosen(settings: Config, options: RunOptions, count_tracers: Callable[[], f
     return Choice((asked,), f"as asked for; but there are {reason}", count)
 
 
-def _counted(
-    settings: Config, options: RunOptions, weights: Path, frames: Sequence[Frame], prepared: Prepared, steps: Steps
-) -> float | None:
+def _counted(settings: Config, chain: Chain, weights: Path) -> float | None:
     """Return how many tracers for each microlens the first image holds, as the run before has counted if it could."""
-    shape, level = settings.image_shape(), Background.parse(options.background)
+    options, frames, steps = chain.options, chain.frames, chain.steps
+    shape, level = settings.image_shape(), options.level
     first = _first_readable(frames, shape, options.keep_going)
     files = (weights, frames[first].path, *filter(None, (options.dark, level.path)))
-    mask = "" if options.mask in (None, STILL) else sha256(Path(str(options.mask)))
+    mask = "" if options.mask_file is None else sha256(options.mask_file)
     words = other_frames(level, frames)(first)
     counted_from = " ".join([*map(sha256, files), str(frames[first].page), mask, words])
     steps.told["counted_from"] = hashlib.sha256(counted_from.encode()).hexdigest()
     if steps.earlier.get("counted_from") == steps.told["counted_from"] and "tracers_per_lens" in steps.earlier:
         return cast("float | None", steps.earlier["tracers_per_lens"])
-    return _tracers_per_lens(settings, options, weights, frames, first, prepared)
-
-
-def _tracers_per_lens(
-    settings: Config, options: RunOptions, weights: Path, frames: Sequence[Frame], first: int, prepared: Prepared
-) -> float | None:
-    """Return how many tracers for each microlens an image holds."""
-    content = prepared.searchable(weights, settings)
-    shape, level = content.image_shape, Background.parse(options.background)
-    dark = image_files.read_reference(options.dark, shape) if options.dark else None
+    content = chain.prepared.searchable(weights, settings)
+    shape = content.image_shape
+    dark = options.dark_image(shape)
     # What stands still would take a look at every image, and a pair hardly shows it better than one counts without.
-    mask = None if options.mask == STILL else mask_of(options.mask, frames, shape, 0.0)
-    bench = prepared.bench(content, settings, dark, mask)
+    bench = chain.prepared.bench(content, settings, dark, mask_of(options.mask_file, frames, shape, 0.0))
     read = reader(level, frames, shape, dark, options.keep_going)
     return particles.tracers_per_lens(bench, particles.frame_of(bench, *read(first)))
+
+
+def planned(settings: Config, chain: Chain, choose: Callable[[Path], Sequence[FlowMethod]]) -> dict[str, Any]:
+    """Return what a run would make, and what that takes; write nothing.
+
+    Parameters
+    ----------
+    choose : tells by which methods the flow will be measured, by the weights
+
+    Raises
+    ------
+    LfpivError : the run would not begin; as where calibration or weights are there, and were made from something else
+    """
+    output, options, console = chain.steps.output, chain.options, chain.steps.console
+    targets = {
+        "calibrate-snapshot": calibrate.target_of(chain.config, output / CALIBRATION, chain.photographs),
+        "build-weights": build_weights.target_of(chain.config, output / WEIGHTS, chain.made_with),
+    }
+    before: list[str] = []
+    for name, target in targets.items():
+        # What is made of something that is not there yet is made after it.
+        if before or pending([target], (), chain.common["overwrite"], resume=True, dry=True):
+            before.append(name)
+    counts = {"frames": len(chain.order), "pairs": len(chain.share), "steps_to_make": before}
+    if before:
+        return counts | _from_nothing(settings, chain)
+    weights, to_come = output / WEIGHTS, _weights_to_come(chain)
+    methods = choose(weights)
+    told: dict[str, dict[str, Any]] = {}
+    for method in methods:
+        if options.follow:
+            # The frames of a sequence depend on the whole config.
+            chosen = replace(chain.following(dry_run=True), resume=to_come is None)
+            told[method] = follow_particles(weights, options.images, output, chosen, **chain.common)
+            continue
+        found = chain.reconstruction(method, weights, to_come)
+        in_time = method == "particles" and not chain.pairs.separate
+        if options.keep == "all" or in_time:
+            told[method] = dry_run(found, chain.batch_options(shared=False), console)
+        if not in_time:
+            size = field_bytes(settings, settings.grid()) if method == "volumes" else None
+            batch = chain.in_pairs(method, found, size)
+            told[RESULTS[method]] = dry_run(batch, chain.batch_options(shared=True), console)
+    return counts | {"method": " and ".join(methods)} | _together(told, output)
+
+
+def with_overwrite(settings: Config, chain: Chain, choose: Callable[[Path], Sequence[FlowMethod]]) -> str:
+    """Return in words what a run that may overwrite makes again and what it keeps; nothing where that is not known."""
+    try:
+        told = planned(settings, chain, choose)
+    except LfpivError:
+        return ""
+    before = {"calibrate-snapshot": CALIBRATION, "build-weights": WEIGHTS}
+    again = [before[step] for step in told["steps_to_make"]]
+    kept = [name for name in before.values() if name not in again]
+    if again:
+        again.append("what depends on it")
+    else:
+        for folder, number in told["to_make"].items():
+            # With how many of a folder's files are meant, unless all are.
+            skipped = told["skipped"][folder]
+            again += [f"{number} of {number + skipped} {folder}" if skipped else folder] if number else []
+            kept += [f"{skipped} of {number + skipped} {folder}" if number else folder] if skipped else []
+        in_time = "particles" in told["to_make"] and not chain.pairs.separate
+        if in_time and (told["to_make"]["particles"] or _weights_to_come(chain) is not None):
+            again.append("tracks")
+        if again and chain.options.combine:
+            again.append("combined")
+    if not again:
+        return ""
+    made, left = (" and ".join(filter(None, (", ".join(names[:-1]), names[-1]))) for names in (again, kept or [""]))
+    return f"; with it the run makes {made} again" + (f" and keeps {left}" if kept else "")
+
+
+def _weights_to_come(chain: Chain) -> Gone | None:
+    """Return the weights with the record that they will carry; None where it is the one that they have."""
+    weights = chain.steps.output / WEIGHTS
+    made = build_weights.target_of(chain.config, weights, chain.made_with).record
+    return None if without_warnings(carried_record(weights)) == made else Gone(sha256(weights), made)
+
+
+def _from_nothing(settings: Config, chain: Chain) -> dict[str, Any]:
+    """Return what is made where there are no weights yet."""
+    options, grid, console = chain.options, settings.grid(), chain.steps.console
+    good = [k for k in chain.order if chain.frames[k].fault is None]
+    whole = [number for number in chain.share if set(chain.pairs.pairs[number]) <= set(good)]
+    asked = "particles" if options.follow and options.method == "auto" else options.method
+    methods: list[FlowMethod] = ["volumes", "particles"] if asked == "both" else ["volumes"]
+    if asked == "particles":
+        methods = ["particles"]
+    calibration = chain.steps.output / CALIBRATION
+    cost: Cost | None = None
+    # What the weights will cost is not always known without a calibration.
+    with contextlib.suppress(LfpivError):
+        plan = plan_of(settings, read_calibration(calibration) if calibration.exists() else None)
+        cost = cost_of(settings, plan.camera, plan.source, plan.grid.padded(plan.padding))
+    held = None if cost is None else cost.image_bytes
+    sizes = {
+        "volumes": (FLOAT_BYTES * math.prod(grid.shape_xyz), field_bytes(settings, grid)),
+        "particles": (None, None),
+    }
+    told = {}
+    counts = ((len(chain.order), len(good)), (len(chain.share), len(whole)))
+    for method in methods:
+        names = ((method, "reconstruct"), (RESULTS[method], "correlate" if method == "volumes" else "track"))
+        for (folder, label), (given, count), size in zip(names, counts, sizes[method], strict=True):
+            dropped = options.keep == "results" and chain.pairs.separate | (method == "volumes")
+            if dropped and folder == method:
+                continue  # the files of a pair at a time
+            disk = None if size is None else count * (size + RECORD_BYTES) / MB
+            told[folder] = {
+                "to_make": count,
+                "skipped": 0,
+                "unreadable": given - count,
+                "disk_mb": disk,
+                "disk_by": None if disk is None else AT_MOST,
+            } | time_and_memory("reconstruct" if dropped else label, count, Expected(size, held), console)
+    told_method = f"{asked}, reckoned as volumes" if asked == "auto" else asked
+    built = {"weights_mb": None if cost is None else cost.weights_bytes / MB}
+    return {"method": told_method} | built | _together(told, chain.steps.output)
+
+
+def _together(told: Mapping[str, Mapping[str, Any]], output: Path) -> dict[str, Any]:
+    """Return what several batches tell: the counts of each, the sums of disk and time, the most of memory."""
+    working = [each for each in told.values() if each["to_make"]]
+    there = next(path for path in (output.absolute(), *output.absolute().parents) if path.exists())
+    figures: dict[str, Any] = {
+        key: {name: each[key] for name, each in told.items()} for key in ("to_make", "skipped", "unreadable")
+    }
+    for key, name in (("disk_mb", "disk"), ("seconds", "seconds")):
+        # A sum is known where all its parts are.
+        known = [each[key] for each in working]
+        figures |= {key: None if None in known else sum(known), f"{name}_by": _words(f"{name}_by", working)}
+        if name == "disk":
+            figures["disk_free_mb"] = shutil.disk_usage(there).free / MB
+    memory = [each["memory_mb"] for each in working if each["memory_mb"] is not None]
+    figures |= {"memory_mb": max(memory, default=None), "memory_by": _words("memory_by", working)}
+    listed = [path for each in told.values() for path in each.get("would_make", ())]
+    return figures | ({"would_make": listed} if listed else {})
+
+
+def _words(key: str, told: Sequence[Mapping[str, Any]]) -> str | None:
+    """Return all the ways in which a figure is known."""
+    return "; ".join(dict.fromkeys(each[key] for each in told if each[key])) or None

@@ -1,42 +1,181 @@
-"""The steps of `run` by the stages of the single commands, each for all frames or pairs."""
+"""The steps of `run` by the stages of the single commands, each for all frames or pairs.
+
+Each is told and taken, and what it made is written down in `run.json`. A step whose files are complete and made alike
+leaves them as they are; its summary is then the one of the run that made them.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+import json
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
-from lfpiv_cli.errors import InputError, PartialError
+from lfpiv_cli.console import Console
+from lfpiv_cli.errors import InputError, LfpivError, OutputExistsError, PartialError, StoppedEarlyError
+from lfpiv_cli.files.atomic import write_json
 from lfpiv_cli.files.batch import VTKHDF_SUFFIX, Frame, Target
 from lfpiv_cli.files.pairing import Pairs
-from lfpiv_cli.files.provenance import Gone
-from lfpiv_cli.files.shares import awaited
+from lfpiv_cli.files.provenance import Gone, bear_alike, carried_record, sha256
+from lfpiv_cli.files.shares import Deadline, awaited
 from lfpiv_cli.names import FlowMethod, Kept, RunMethod
 from lfpiv_cli.verbs import correlate as correlating
 from lfpiv_cli.verbs import track as tracking
-from lfpiv_cli.verbs.batches import ALL, BatchOptions, Failure, Worked, WorkOptions, work_through
+from lfpiv_cli.verbs.batches import ALL, BatchOptions, Failure, Stamp, Worked, WorkOptions, stamp_of, work_through
 from lfpiv_cli.verbs.build_weights import BuildWeightsOptions, build_weights_file
 from lfpiv_cli.verbs.calibrate import CalibrateOptions, calibrate_snapshot
 from lfpiv_cli.verbs.combine import combine_vectors
-from lfpiv_cli.verbs.correlate import CorrelateOptions, Correlation, correlate_files
+from lfpiv_cli.verbs.correlate import CorrelateOptions, Correlation
 from lfpiv_cli.verbs.follow import PLAYBACK, TRACKS, FollowOptions, follow_particles
-from lfpiv_cli.verbs.pairs import PairByPair, PairOptions, failures_of, joined_by
+from lfpiv_cli.verbs.frames import ImageOptions
+from lfpiv_cli.verbs.pairs import PairByPair, PairOptions, failures_of
 from lfpiv_cli.verbs.particles import Prepared
-from lfpiv_cli.verbs.reconstruct import Reconstruction, ReconstructOptions, reconstruct_files
-from lfpiv_cli.verbs.steps import Steps
-from lfpiv_cli.verbs.track import TrackOptions, Tracks, grid_paths, track_particles
+from lfpiv_cli.verbs.reconstruct import Reconstruction, ReconstructOptions
+from lfpiv_cli.verbs.track import TrackOptions, Tracks, grid_paths
+
+RECORD = "run.json"
+# What becomes of a step: its files are made; complete and left as they are; or complete and their record is another, as
+# settings have changed that they do not depend on.
+MADE, KEPT, RECORDED = "made", "kept", "recorded anew"
+OURS = (".h5", ".vtkhdf")
+
+
+@dataclass(frozen=True)
+class Steps:
+    """The steps of a run, those that were taken so far.
+
+    Attributes
+    ----------
+    output : the run's folder
+    earlier : what `run.json` said before
+    deadline : when all steps have to be done
+    recorded : whether they are written down; of several shards none can tell of all
+    told : what it says now
+    files : what all steps have made or kept
+    """
+
+    output: Path
+    console: Console
+    earlier: Mapping[str, Any]
+    deadline: Deadline = field(default_factory=Deadline)
+    recorded: bool = True
+    told: dict[str, Any] = field(default_factory=lambda: {"steps": {}, "summaries": {}})
+    files: list[Path] = field(default_factory=list)
+
+    def take(self, name: str, files: Sequence[Path], make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+        """Take a step, which makes files; write down and return what it told.
+
+        Raises
+        ------
+        LfpivError : as the step does, with its name and what becomes of the steps before
+        StoppedEarlyError : the time is over
+        """
+        number = len(self.told["steps"]) + 1
+        if not self.deadline.leaves_time():
+            raise StoppedEarlyError(
+                f"stopped before step {number}, {name}: the time limit of {self.deadline.limit_s:g} s is over; the "
+                "same command goes on from there"
+            )
+        self.console.say(f"step {number}: {name}")
+        before, times = [_recorded(path) for path in files], [stamp_of(path) for path in files]
+        hashes = self._hashes(files)
+        try:
+            summary = make()
+        except LfpivError as error:
+            goes_on = number > 1 and not isinstance(error, OutputExistsError)
+            done = "; what is done stays, and the same command goes on from there" if goes_on else ""
+            raise type(error)(f"step {number}, {name}: {error}{done}") from error
+        state = _state(files, before, times)
+        if state != MADE:
+            why = "complete and made alike" if state == KEPT else "as it depends on nothing that has changed"
+            self.console.say(f"step {number}: {state}, {why}")
+            if self.earlier.get("steps", {}).get(name, {}).get("files") == hashes:
+                summary = self.earlier.get("summaries", {}).get(name, summary)
+        self.told["steps"][name] = {"state": state, "files": self._hashes(files)}
+        self.told["summaries"][name] = summary
+        self.files.extend(files)
+        self.write()
+        return summary
+
+    def _hashes(self, files: Iterable[Path]) -> dict[str, str]:
+        """Return the hash of each file that is there by its name in the folder; of those that failed there is none."""
+        return {path.relative_to(self.output).as_posix(): sha256(path) for path in files if path.exists()}
+
+    def count(self, state: str) -> int:
+        """Return how many steps were made, kept, or recorded anew."""
+        return sum(step["state"] == state for step in self.told["steps"].values())
+
+    def summary(self) -> dict[str, Any]:
+        """Return what is told of the steps."""
+        return {"steps_made": self.count(MADE), "steps_kept": self.count(KEPT), "folder": str(self.output)}
+
+    def write(self, *, whole: bool = False) -> None:
+        """Write down what is known so far: of steps to come what the run before told, unless this is the `whole` run.
+
+        What a step told would be lost where another one fails before it is found to be complete.
+        """
+        if not self.recorded:
+            return
+        told = dict(self.told)
+        for part in () if whole else ("steps", "summaries"):
+            told[part] = self.earlier.get(part, {}) | self.told[part]
+        # What was warned of, in this run and when what it kept was made.
+        recorded = [warning for path in self.files for warning in (_recorded(path) or {}).get("warnings", ())]
+        told["warnings"] = []
+        for warning in (*recorded, *(notice.record() for notice in self.console.warned or ())):
+            if warning not in told["warnings"]:
+                told["warnings"].append(warning)
+        write_json(self.output / RECORD, told, overwrite=True)
+
+
+def earlier_run(output: Path, overwrite: bool) -> dict[str, Any]:
+    """Return what `run.json` says of the run before; nothing where there was none.
+
+    Raises
+    ------
+    OutputExistsError : it is not ours, and `overwrite` is false
+    """
+    path = output / RECORD
+    try:
+        told = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        told = None
+    if isinstance(told, dict) and isinstance(told.get("steps"), dict):
+        return told
+    if path.exists() and not overwrite:
+        raise OutputExistsError(f"{path}: exists, and is not of a run (use --overwrite to replace it)")
+    return {}
+
+
+def _state(files: Sequence[Path], before: Sequence[Mapping[str, Any] | None], times: Sequence[Stamp]) -> str:
+    """Return what became of files, given the records and times that they had before a step."""
+    if list(times) == [stamp_of(path) for path in files]:
+        return KEPT
+    records = [(old, _recorded(path)) for path, old in zip(files, before, strict=True) if path.suffix in OURS]
+    alike = bool(records) and all(old and new and old != new and bear_alike(old, new) for old, new in records)
+    return RECORDED if alike else MADE
+
+
+def _recorded(path: Path) -> dict[str, Any] | None:
+    """Return the record that a file of ours carries; None where there is none, or a broken one."""
+    if path.suffix not in OURS or not path.exists():
+        return None
+    try:
+        return carried_record(path)
+    except InputError:
+        return None
 
 
 @dataclass(frozen=True, kw_only=True)
-class RunOptions(PairOptions, WorkOptions):
+class RunOptions(PairOptions, ImageOptions, WorkOptions):
     """What `run` is given besides the config; it resumes by itself.
 
     Attributes
     ----------
     images : of the flow
-    white, dark, board, depth_mm : as of `calibrate_snapshot`; the dark image also of the flow
-    background, mask : as of `reconstruct`
+    white, board, depth_mm : as of `calibrate_snapshot`, which is given the dark image, too
     method : by volumes, particles or both; `auto`: by how many tracers there are
     dt_s : time from one image to the next, in place of the config's
     combine : of both methods, also one field that weights their vectors by their uncertainties
@@ -47,11 +186,8 @@ class RunOptions(PairOptions, WorkOptions):
 
     images: Sequence[Path]
     white: Sequence[Path] = ()
-    dark: Path | None = None
     board: Sequence[Path] = ()
     depth_mm: Sequence[float] = ()
-    background: str | None = None
-    mask: str | Path | None = None
     method: RunMethod = "auto"
     dt_s: float | None = None
     combine: bool = False
@@ -60,9 +196,10 @@ class RunOptions(PairOptions, WorkOptions):
     report: bool = True
 
 
-Outcome = TypeVar("Outcome")
 CALIBRATION, WEIGHTS, PICTURE = "calibration.h5", "weights.h5", "calibration.png"
 VOLUMES, PARTICLES = ReconstructOptions(), ReconstructOptions(solver="particles")
+# What is made of the pairs of each method, by the name of the file, or of the folder of several.
+RESULTS: dict[FlowMethod, str] = {"volumes": "vectors", "particles": "tracks"}
 # The files of vectors by the numbers of their pairs.
 Vectors = dict[int, Path]
 
@@ -97,7 +234,7 @@ class Chain:
         self.order = list(dict.fromkeys([*(k for pair in ours for k in pair), *(alone if shard.is_last else [])]))
         # Of several shards the first one tells them.
         self.failures = failures_of(pairs) if shard.number == 1 else []
-        self._prepared, self._overwrite = prepared, overwrite
+        self.prepared, self._overwrite = prepared, overwrite
         self.pairs = replace(pairs, left_out=())
 
     @property
@@ -115,14 +252,9 @@ class Chain:
     @property
     def photographs(self) -> CalibrateOptions:
         """What the calibration is given."""
-        options = self.options
+        given, picture = self.options, self.steps.output / PICTURE
         return CalibrateOptions(
-            white=options.white,
-            dark=options.dark,
-            board=options.board,
-            depth_mm=options.depth_mm,
-            picture=self.steps.output / PICTURE,
-            resume=True,
+            white=given.white, dark=given.dark, board=given.board, depth_mm=given.depth_mm, picture=picture, resume=True
         )
 
     @property
@@ -146,12 +278,6 @@ class Chain:
         )
         return weights
 
-    def vectors_by(self, method: FlowMethod, weights: Path) -> Vectors:
-        """Measure the flow by volumes or by particles; return the files of vectors, none where tracks are all."""
-        if method == "volumes":
-            return self._by_volumes(weights)
-        return self._followed(weights) if self.options.follow else self._by_particles(weights)
-
     def combined(self, first: Vectors, second: Vectors) -> Vectors:
         """Weight the vectors of two methods by their uncertainties; return the files."""
         every = self.of_pairs("combined")
@@ -169,69 +295,86 @@ class Chain:
 
     def reconstruction(self, method: FlowMethod, weights: Path, to_come: Gone | None = None) -> Reconstruction:
         """Return the batch of the frames of this share, of weights as they are `to_come` if they change."""
-        by_particles = method == "particles"
-        chosen = replace(PARTICLES, residual=self.options.keep == "all") if by_particles else VOLUMES
-        given = (weights, self.options.images, self.steps.output / method, self._of_images(chosen), self._overwrite)
-        return Reconstruction(*given, self.pairs if by_particles else None, self._prepared, self.order, to_come)
+        by_particles, kept = method == "particles", self.options.keep == "all" or not self.pairs.separate
+        chosen = replace(PARTICLES, residual=kept) if by_particles else VOLUMES
+        options = replace(chosen, **self._of_images, **self._resuming)
+        given = (weights, self.options.images, self.steps.output / method, options, self._overwrite)
+        return Reconstruction(*given, self.pairs if by_particles else None, self.prepared, self.order, to_come)
 
-    def correlated(self, found: Reconstruction, file_bytes: float | None = None) -> PairByPair[correlating.Outcome]:
-        """Return the batch of pairs, each from its images to its vectors, of so many bytes."""
-        join = joined_by(Correlation, self._correlating, self._overwrite)
-        targets = [Target(path, dict) for path in self.of_pairs("vectors")]
-        return PairByPair(found, join, self.pairs, targets, file_bytes)
-
-    def tracked(self, found: Reconstruction) -> PairByPair[tracking.Outcome]:
-        """Return the batch of separate pairs, each from its images to its tracks."""
-        join = joined_by(Tracks, self._tracking, self._overwrite)
-        targets = [Target(path, dict, grid_paths(path, 1)) for path in self.of_pairs("tracks")]
-        return PairByPair(found, join, self.pairs, targets)
-
-    @property
-    def _correlating(self) -> CorrelateOptions:
-        return CorrelateOptions(dt_s=self.options.dt_s, **self._resuming)
-
-    @property
-    def _tracking(self) -> TrackOptions:
-        return TrackOptions(dt_s=self.options.dt_s, grid=True, **self._resuming)
-
-    def _by_volumes(self, weights: Path) -> Vectors:
-        paths, options = self.of_pairs("vectors"), self._correlating
-        if self.options.keep == "results":
-            batch = self.correlated(self.reconstruction("volumes", weights))
-            self._take_pair_by_pair("correlate", batch, lambda worked: correlating.summary_of(worked, worked.total()))
-            return self._standing(paths, self.share)
-        volumes, failed = self._reconstructed("reconstruct", weights, "volumes", VOLUMES)
-        whole = self._without(failed)
-        output = paths[whole[0]] if len(whole) == 1 else paths[0].parent
-        given, pairs = self._only(volumes, whole)
-        self._take(
-            "correlate",
-            [paths[number] for number in whole],
-            lambda: correlate_files(given, output, options, **self.common, pairs=pairs),
-        )
-        return self._standing(paths, whole)
-
-    def _by_particles(self, weights: Path) -> Vectors:
-        if not self.pairs.separate:
+    def vectors_by(self, method: FlowMethod, weights: Path) -> Vectors:
+        """Measure the flow by volumes or by particles; return the files of vectors, none where tracks are all."""
+        given, output = self.options, self.steps.output
+        if method == "volumes" or self.pairs.separate:
+            return self._by_pairs(method, weights)
+        if not given.follow:
             return self._tracked_in_time(weights)
-        tracks, options = self.of_pairs("tracks"), self._tracking
-        grids = [grid_paths(path, 1)[0] for path in tracks]
+        files, chosen = [*self._of_frames("particles"), output / TRACKS, output / PLAYBACK], self.following()
+        self._take("follow", files, lambda: follow_particles(weights, given.images, output, chosen, **self.common))
+        return {}
+
+    def in_pairs(self, method: FlowMethod, found: Reconstruction, file_bytes: float | None = None) -> PairByPair[Any]:
+        """Return the batch of pairs, each from its images to its vectors or tracks, of so many bytes if known."""
+        results = self.of_pairs(RESULTS[method])
+        targets = [Target(path, dict, grid_paths(path, 1) if method == "particles" else ()) for path in results]
+        return PairByPair(found, partial(self._measured, method), self.pairs, targets, file_bytes)
+
+    def _measured(
+        self,
+        method: FlowMethod,
+        files: Sequence[Path],
+        output: Path,
+        pairs: Pairs | None,
+        gone: Mapping[Path, Gone] | None = None,
+    ) -> Correlation | Tracks:
+        """Return the batch of pairs of volumes, or of particles."""
+        dt_s, resuming = self.options.dt_s, self._resuming
+        if method == "volumes":
+            return Correlation(files, output, CorrelateOptions(dt_s=dt_s, **resuming), self._overwrite, pairs, gone)
+        return Tracks(files, output, TrackOptions(dt_s=dt_s, grid=True, **resuming), self._overwrite, pairs, gone)
+
+    def _worked(self, batch: Correlation | Tracks | Reconstruction) -> dict[str, Any]:
+        """Work through a batch of which nothing fails; return what is told of it."""
+        worked: Worked[Any] = work_through(batch, self.batch_options(shared=False), self.steps.console)
+        return worked.ensure_whole(batch.summary(worked), batch.unit)
+
+    def _by_pairs(self, method: FlowMethod, weights: Path) -> Vectors:
+        """Measure the flow in each pair, `keep` has it one after the other or all frames first."""
+        paths, name = self.of_pairs(RESULTS[method]), "correlate" if method == "volumes" else "track"
+        vectors = paths if method == "volumes" else [grid_paths(path, 1)[0] for path in paths]
+        numbers = list(self.share)
         if self.options.keep == "results":
-            results = [tracks[number] for number in self.share]
-            batch = self.tracked(self.reconstruction("particles", weights))
-            self._take_pair_by_pair("track", batch, lambda worked: tracking.summary_of(worked, results))
-            return {number: grids[number] for number in self._standing(tracks, self.share)}
-        particles, failed = self._reconstructed("reconstruct particles", weights, "particles", PARTICLES, self.pairs)
-        whole = self._without(failed)
-        output = tracks[whole[0]] if len(whole) == 1 else tracks[0].parent
-        ours = [each for number in whole for each in (tracks[number], grids[number])]
-        given, pairs = self._only(particles, whole)
-        self._take("track", ours, lambda: track_particles(given, output, options, **self.common, pairs=pairs))
-        return {number: grids[number] for number in self._standing(tracks, whole)}
+            batch = self.in_pairs(method, self.reconstruction(method, weights))
+
+            def make() -> dict[str, Any]:
+                worked = work_through(batch, self.batch_options(shared=True), self.steps.console)
+                if method == "volumes":
+                    summary = correlating.summary_of(worked, worked.total())
+                else:
+                    summary = tracking.summary_of(worked, [paths[number] for number in self.share])
+                return worked.ensure_whole(summary, batch.unit)
+
+        else:
+            files, failed = self._reconstructed(method, weights)
+            broken = {number for number, frame in enumerate(self.frames) if frame.stem in failed}
+            numbers = [number for number in self.share if not broken & set(self.pairs.pairs[number])]
+            if not numbers:
+                raise InputError(f"of every pair a frame has failed, the first because {self.failures[0].error}")
+            output = paths[numbers[0]] if len(numbers) == 1 else paths[0].parent
+            pairs = [self.pairs.pairs[number] for number in numbers]
+            place = {k: place for place, k in enumerate(sorted({k for pair in pairs for k in pair}))}
+            ours = replace(self.pairs, pairs=tuple((place[first], place[second]) for first, second in pairs))
+
+            def make() -> dict[str, Any]:
+                return self._worked(self._measured(method, [files[k] for k in place], output, ours))
+
+        made = [path for number in numbers for path in dict.fromkeys((paths[number], vectors[number]))]
+        self._take(name, made, make)
+        lost = {failure.name for failure in self.failures}
+        return {number: vectors[number] for number in numbers if paths[number].stem not in lost}
 
     def _tracked_in_time(self, weights: Path) -> Vectors:
         """Track particles through all frames; return the vectors of each interval."""
-        found, failed = self._reconstructed("reconstruct particles", weights, "particles", PARTICLES, self.pairs)
+        found, failed = self._reconstructed("particles", weights)
         if self.options.shard != ALL:
             self.steps.console.say("tracks go through all frames: the same command without --shard makes them")
             return {}
@@ -241,54 +384,30 @@ class Chain:
             error = "a frame of the sequence is missing, and tracks would take those beside it for neighbours in time"
             self.failures.append(Failure(TRACKS, error))
             return {}
-        self._take("track", [tracks, *grids], lambda: track_particles(found, tracks, self._tracking, **self.common))
+        self._take("track", [tracks, *grids], lambda: self._worked(self._measured("particles", found, tracks, None)))
         return dict(enumerate(grids))
-
-    def _followed(self, weights: Path) -> Vectors:
-        given, output, chosen = self.options, self.steps.output, self.following()
-        files = [*self._of_frames("particles"), output / TRACKS, output / PLAYBACK]
-        self._take("follow", files, lambda: follow_particles(weights, given.images, output, chosen, **self.common))
-        return {}
 
     def following(self, dry_run: bool = False) -> FollowOptions:
         """Return the options of a sequence that is followed."""
         given = self.options
-        of_images: dict[str, Any] = {"dark": given.dark, "background": given.background, "mask": given.mask}
-        return FollowOptions(**of_images, dt_s=given.dt_s, dry_run=dry_run, **self._resuming)
+        return FollowOptions(**self._of_images, dt_s=given.dt_s, dry_run=dry_run, **self._resuming)
 
     def batch_options(self, shared: bool) -> BatchOptions:
         """Return the options of a batch, `shared` where it is one of all pairs."""
         return BatchOptions(**self._resuming, shard=self.options.shard if shared else ALL)
 
-    def _take_pair_by_pair(
-        self, name: str, batch: PairByPair[Outcome], summary: Callable[[Worked[Outcome]], dict[str, Any]]
-    ) -> None:
-        """Make the results of pairs one after the other, and drop what they are made of."""
-
-        def make() -> dict[str, Any]:
-            worked = work_through(batch, self.batch_options(shared=True), self.steps.console)
-            return worked.ensure_whole(summary(worked), batch.unit)
-
-        self._take(name, [path for number in self.share for path in batch.targets[number].paths], make)
-
-    def _reconstructed(
-        self, name: str, weights: Path, folder: str, chosen: ReconstructOptions, pairs: Pairs | None = None
-    ) -> tuple[list[Path], set[str]]:
+    def _reconstructed(self, method: FlowMethod, weights: Path) -> tuple[list[Path], set[str]]:
         """Reconstruct all frames into a folder; return the files, and the names of frames that failed."""
-        paths, options, before = self._of_frames(folder), self._of_images(chosen), len(self.failures)
-        images, output = self.options.images, paths[0].parent
-        known: dict[str, Any] = {"pairs": pairs, "prepared": self._prepared, "order": self.order}
-        self._take(
-            name,
-            [paths[k] for k in self.order],
-            lambda: reconstruct_files(weights, images, output, options, **self.common, **known),
-        )
+        paths, before = self._of_frames(method), len(self.failures)
+        name = "reconstruct particles" if method == "particles" else "reconstruct"
+        made = [paths[k] for k in self.order]
+        self._take(name, made, lambda: self._worked(self.reconstruction(method, weights)))
         return paths, {failure.name for failure in self.failures[before:]}
 
-    def _of_images(self, chosen: ReconstructOptions) -> ReconstructOptions:
-        """Return options with what is given of the images."""
-        given = self.options
-        return replace(chosen, dark=given.dark, background=given.background, mask=given.mask, **self._resuming)
+    @property
+    def _of_images(self) -> dict[str, Any]:
+        """What is taken off images, and left out of them."""
+        return {"dark": self.options.dark, "background": self.options.background, "mask": self.options.mask}
 
     def _take(self, name: str, files: Sequence[Path], make: Callable[[], dict[str, Any]]) -> None:
         """Take a step of which a part may fail, where the others are to go on."""
@@ -301,31 +420,6 @@ class Chain:
                 return error.figures
 
         self.steps.take(name, files, tolerant)
-
-    def _without(self, failed: set[str]) -> list[int]:
-        """Return the numbers of the pairs of which no frame has failed.
-
-        Raises
-        ------
-        InputError : there is none
-        """
-        broken = {number for number, frame in enumerate(self.frames) if frame.stem in failed}
-        whole = [number for number in self.share if not broken & set(self.pairs.pairs[number])]
-        if not whole:
-            raise InputError(f"of every pair a frame has failed, the first because {self.failures[0].error}")
-        return whole
-
-    def _only(self, of_frames: Sequence[Path], numbers: Sequence[int]) -> tuple[list[Path], Pairs]:
-        """Return the files of the frames of these pairs alone, and how these belong together."""
-        pairs = [self.pairs.pairs[number] for number in numbers]
-        place = {k: place for place, k in enumerate(sorted({k for pair in pairs for k in pair}))}
-        ours = tuple((place[first], place[second]) for first, second in pairs)
-        return [of_frames[k] for k in place], replace(self.pairs, pairs=ours)
-
-    def _standing(self, paths: Sequence[Path], numbers: Iterable[int]) -> Vectors:
-        """Return those of the results that have not failed, by the numbers of their pairs."""
-        failed = {failure.name for failure in self.failures}
-        return {number: paths[number] for number in numbers if paths[number].stem not in failed}
 
     def _of_frames(self, folder: str) -> list[Path]:
         """Return the file of each frame in a folder."""

@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.calibration.board_pose import BoardGeometry
 from lfpiv_cli.calibration.model import mid_plane_z_mm
 from lfpiv_cli.console import CONSOLE, Console
@@ -55,8 +55,16 @@ def tracers_of(settings: Config, camera: Camera, reference: Reference, motion: s
     """
     scene, volume = settings.simulation, settings.grid(reference)
     light = light_z_mm_of(settings, reference)
-    lit = volume if light is None else _between(volume, light)
-    reach = _reach_mm(settings, camera, lit)
+    lit = volume
+    if light is not None:
+        # The volume between other depths, one voxel deep.
+        (nx, ny, _), (dx, dy, _), (x, y, _) = volume.shape_xyz, volume.spacing_mm, volume.origin_mm
+        lit = Grid((nx, ny, 1), (dx, dy, light[1] - light[0]), (x, y, 0.5 * (light[0] + light[1])))
+    # How far beside the volume a tracer still lights its pixels.
+    if (through := settings.scene_space()) is None:
+        reach = blur_radius_mm(camera, settings.media_model(), lit)
+    else:
+        reach = float(spread_mm(camera, through, lit).max())
     # Laterally the reach covers half the time between two frames; an edge of the light is sharp.
     carrying = motion if light is not None else replace(motion, frames=motion.frames - 1)
     carried_s = max(abs(time_s) for time_s in carrying.carried_s())
@@ -78,14 +86,6 @@ def tracers_of(settings: Config, camera: Camera, reference: Reference, motion: s
     )
 
 
-def _reach_mm(settings: Config, camera: Camera, lit: Grid) -> float:
-    """Return how far beside the volume a tracer still lights its pixels."""
-    scene = settings.scene_space()
-    if scene is None:
-        return blur_radius_mm(camera, settings.media_model(), lit)
-    return float(spread_mm(camera, scene, lit).max())
-
-
 def light_z_mm_of(settings: Config, reference: Reference) -> tuple[float, float] | None:
     """Return between which depths from the focal point there is light, not beyond a channel's walls; None: everywhere.
 
@@ -101,12 +101,6 @@ def light_z_mm_of(settings: Config, reference: Reference) -> tuple[float, float]
     if low >= high:
         raise ConfigError(f"simulation.light_z_mm: is {list(light)}, beyond a wall {half:g} mm from the mid plane")
     return reference.depth_to_focal_point(low), reference.depth_to_focal_point(high)
-
-
-def _between(volume: Grid, z_mm: tuple[float, float]) -> Grid:
-    """Return the volume between other depths, one voxel deep."""
-    (nx, ny, _), (dx, dy, _), (x, y, _) = volume.shape_xyz, volume.spacing_mm, volume.origin_mm
-    return Grid((nx, ny, 1), (dx, dy, z_mm[1] - z_mm[0]), (x, y, 0.5 * (z_mm[0] + z_mm[1])))
 
 
 def _walls(settings: Config, reference: Reference) -> scenes.Box | None:
@@ -142,14 +136,6 @@ def bubbles_walls_of(settings: Config, reference: Reference) -> scenes.Box | Non
     if walls is None or scene.flow is None or scene.flow.kind != "square_duct":
         raise ConfigError("simulation.bubbles: bubbles stick to a channel's wall; simulation.flow is no square_duct")
     return walls
-
-
-def bubbles_of(settings: Config, seen: scenes.Box, reference: Reference, rng: np.random.Generator) -> Bubbles | None:
-    """Return the bubbles at the channel's wall, None where there are none."""
-    scene, walls = settings.simulation, bubbles_walls_of(settings, reference)
-    if walls is None:
-        return None
-    return bubbles_at_wall(scene.bubbles, scene.bubble_diameter_mm, scene.bubble_wall, seen, walls, rng)
 
 
 # Measured on one core: a white image, of 0.1 to 6 million pixels. An image of tracers takes longer with their number.
@@ -215,50 +201,42 @@ def simulate_particles(
     camera, space = _recording(settings), _flow_space(settings, reference)
     motion = _motion(settings, reference)
     tracers = tracers_of(settings, camera.optics, reference, motion)
-    bubbles = bubbles_of(settings, tracers.box, reference, _generator(settings, 4))
-    still: NDArray[np.float64] | float = 0.0
-    if bubbles is not None:
+    walls = bubbles_walls_of(settings, reference)
+    bubbles: Bubbles | None = None
+    still: Floats | float = 0.0
+    if walls is not None:
+        rng = _generator(settings, 4)
+        bubbles = bubbles_at_wall(scene.bubbles, scene.bubble_diameter_mm, scene.bubble_wall, tracers.box, walls, rng)
         still = render_bubbles(
             camera.optics, space, bubbles, scene.bubble_counts, _generator(settings, 5), camera.waves
         )
     with console.progress(scene.frames * tracers.count, "simulate") as advance:
         found = scenes.simulate_particles(
-            camera,
-            space,
-            tracers,
-            motion,
-            _generator(settings, 2),
-            still=still,
-            progress=advance,
+            camera, space, tracers, motion, _generator(settings, 2), still=still, progress=advance
         )
     for name, image in zip(images, found.images, strict=True):
         write_tiff(paths[name], image, overwrite)
-    write_particles(paths["particles.npz"], _particles(found), overwrite)
+    motions = (found.positions_mm, found.velocities_m_s, found.brightness, found.diameters_mm)
+    particles = Particles(*motions, found.frame_positions_mm, found.frame_brightness)
+    write_particles(paths["particles.npz"], particles, overwrite)
     truth = found.truth | {"reference_z_mm": reference.z_mm}
     if isinstance(space, CurvedSpace):
         dark = int(unseen(camera.optics, space, found.positions_mm).sum())
         truth["particles_unseen"] = dark
-        console.warn(_unseen_notices(dark, tracers.count, config))
+        if dark:
+            text = (
+                f"{dark} of {tracers.count} tracers send no light to the lens: outside the fluid, or hidden by a "
+                "curved wall"
+            )
+            remedy = "scene, and where simulation.flow is seeded"
+            console.warn([Notice("tracers-unseen", config.name, text, remedy, dark)])
     if bubbles is not None:
         truth["bubbles_mm"] = bubbles.truth()
     return _write_truth(paths["particles.json"], "simulate particles", truth, settings, config, overwrite)
 
 
-def _unseen_notices(dark: int, count: int, config: Path) -> list[Notice]:
-    """Return what is said of tracers that no light comes from, nothing where there are none."""
-    if not dark:
-        return []
-    text = f"{dark} of {count} tracers send no light to the lens: outside the fluid, or hidden by a curved wall"
-    return [Notice("tracers-unseen", config.name, text, "scene, and where simulation.flow is seeded", dark)]
-
-
 def ensure_experiment(settings: Config) -> None:
-    """Refuse a config from which no white image, board and flow can be simulated, before anything is.
-
-    Raises
-    ------
-    ConfigError
-    """
+    """Refuse a config from which no white image, board and flow can be simulated, before anything is (ConfigError)."""
     reference = simulated_reference(settings)
     _motion(settings, reference)
     _flow_space(settings, reference)
@@ -329,9 +307,14 @@ def _board_still(
     rng: np.random.Generator,
     progress: Callable[[int], None],
 ) -> scenes.SimulatedStill:
+    placement, level = placement_of(settings, z_mm), settings.simulation.peak_counts
+    return scenes.simulate_board(_recording(settings), space, board, placement, level, rng, progress)
+
+
+def placement_of(settings: Config, z_mm: float) -> BoardPlacement:
+    """Return where the simulated board stands at a depth from the focal plane."""
     scene = settings.simulation
-    placement = BoardPlacement(z_mm, scene.board_offset_mm, scene.board_tilt_deg, scene.board_rotation_deg)
-    return scenes.simulate_board(_recording(settings), space, board, placement, scene.peak_counts, rng, progress)
+    return BoardPlacement(z_mm, scene.board_offset_mm, scene.board_tilt_deg, scene.board_rotation_deg)
 
 
 def _begin(
@@ -342,20 +325,14 @@ def _begin(
     pixels = math.prod(settings.image_shape())
     seconds, held = PIXEL_S * pixels * sum(name.endswith(".tif") for name in names), float(HELD_BYTES_A_PIXEL * pixels)
     ensure_room(held, f"simulate, for images of {written(pixels)} pixels,", "a sensor with fewer pixels needs less")
-    console.warn(_work_notices(seconds, held))
+    if seconds > LONG_S or held > MUCH_BYTES:
+        minutes, size = written(seconds / 60.0, 2), written(held / 1e9, 2)
+        text = f"its images will take about {minutes} minutes of a core at least, and {size} GB"
+        share = max(seconds / LONG_S, held / MUCH_BYTES)
+        console.warn([Notice("heavy-work", "camera.sensor", text, "fewer columns and rows", share)])
     for path in paths.values():
         ensure_writable(path, overwrite, [config])
     return settings, paths
-
-
-def _work_notices(seconds: float, held: float) -> list[Notice]:
-    """Return whether images take more time or memory than one would expect."""
-    if seconds <= LONG_S and held <= MUCH_BYTES:
-        return []
-    minutes, size = written(seconds / 60.0, 2), written(held / 1e9, 2)
-    text = f"its images will take about {minutes} minutes of a core at least, and {size} GB"
-    share = max(seconds / LONG_S, held / MUCH_BYTES)
-    return [Notice("heavy-work", "camera.sensor", text, "fewer columns and rows", share)]
 
 
 def _write_truth(
@@ -385,12 +362,7 @@ def _board_space(settings: Config) -> Space:
 
 
 def _flow_space(settings: Config, reference: Reference) -> Space:
-    """Return what the tracers are seen through.
-
-    Raises
-    ------
-    ConfigError : paraxial rays through a scene
-    """
+    """Return what the tracers are seen through (ConfigError: paraxial rays through a scene)."""
     scene = settings.scene_space()
     if scene is not None and settings.simulation.refraction == "paraxial":
         raise ConfigError(
@@ -405,25 +377,9 @@ def _flow_space(settings: Config, reference: Reference) -> Space:
 
 
 def _motion(settings: Config, reference: Reference) -> scenes.Motion:
-    """Return how the tracers move.
-
-    Raises
-    ------
-    ConfigError : there is no flow, or no time between its images
-    """
+    """Return how the tracers move (ConfigError: there is no flow, or no time between its images)."""
     scene, dt_s = settings.simulation, settings.correlation.dt_s
     if dt_s is None:
         raise ConfigError(f"{settings.source}: correlation.dt_s: is missing, and images of a flow need it")
     pulsation = Pulsation(**scene.pulsation.model_dump()) if scene.pulsation else STEADY
     return scenes.Motion(settings.simulated_flow(reference), dt_s, scene.frames, pulsation)
-
-
-def _particles(found: scenes.SimulatedFrames) -> Particles:
-    return Particles(
-        found.positions_mm,
-        found.velocities_m_s,
-        found.brightness,
-        found.diameters_mm,
-        found.frame_positions_mm,
-        found.frame_brightness,
-    )

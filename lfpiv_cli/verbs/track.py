@@ -2,53 +2,36 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, overload
+from typing import Any
 
 import numpy as np
 
 from lfpiv_cli.console import CONSOLE, Console, Frames
-from lfpiv_cli.files import vtkhdf
-from lfpiv_cli.files.batch import Target, output_paths
+from lfpiv_cli.files import particle_file, vtkhdf
+from lfpiv_cli.files.batch import Target, output_paths, results_seen
 from lfpiv_cli.files.config import Config
 from lfpiv_cli.files.hdf5 import fault_of
 from lfpiv_cli.files.inputs import given
-from lfpiv_cli.files.pairing import Pairs
-from lfpiv_cli.files.particle_file import (
-    PARTICLES_FORMAT,
-    TRAJECTORIES_FORMAT,
-    PointRows,
-    Points,
-    StoredTracks,
-    read_points,
-    read_tracks,
-    write_points,
-)
+from lfpiv_cli.files.pairing import Pairs, in_order
 from lfpiv_cli.files.provenance import carried_record, record, with_warnings
-from lfpiv_cli.flow.field import REJECTED, VectorField
+from lfpiv_cli.flow.field import REJECTED
 from lfpiv_cli.names import GridMethod
 from lfpiv_cli.reference import Reference
 from lfpiv_cli.tracks.candidates import Seen, Trajectories
 from lfpiv_cli.tracks.sequences import HALVES_FRAMES
+from lfpiv_cli.verbs import checks
 from lfpiv_cli.verbs.batches import Worked, dry_run, work_through
-from lfpiv_cli.verbs.checks import (
-    Quality,
-    calibration_notices,
-    few_notices,
-    field_notices,
-    quality_of,
-    quality_of_all,
-)
 from lfpiv_cli.verbs.fields import fields_of
 from lfpiv_cli.verbs.frames import dt_notices
-from lfpiv_cli.verbs.pairs import PairBatch, PairBatchOptions, sequence_of
+from lfpiv_cli.verbs.pairs import PairBatch, PairBatchOptions, doubts
 from lfpiv_cli.verbs.tracks import (
+    Lazy,
     Tracking,
     TracksOf,
     ensure_frames,
@@ -60,42 +43,23 @@ from lfpiv_cli.verbs.tracks import (
     tracks_through,
 )
 
-# The tracks of a sequence as they are put together: on a disk, with the last few frames in memory.
-
-
 # States look at so many frames, one after the other; forecasts at fewer.
 KEPT_FRAMES = 2 * max(HALVES_FRAMES) + 1
 
 
-class SeenFrames(Sequence[Seen]):
+class SeenFrames(Lazy[Seen]):
     """The particles of a sequence's frames, read when they are asked for; the last few stay in memory."""
 
-    def __init__(self, count: int, read: Callable[[int], Points]) -> None:
+    def __init__(self, count: int, read: Callable[[int], particle_file.Points]) -> None:
         """Take how many frames there are, and what reads one."""
-        self._count, self._read = count, read
-        self._kept: OrderedDict[int, Seen] = OrderedDict()
+        super().__init__(count, lru_cache(KEPT_FRAMES)(self._seen))
+        self._read = read
         self._counts: dict[int, int] = {}
 
-    def __len__(self) -> int:
-        """Return how many frames there are."""
-        return self._count
-
-    @overload
-    def __getitem__(self, number: int) -> Seen: ...
-
-    @overload
-    def __getitem__(self, number: slice) -> list[Seen]: ...
-
-    def __getitem__(self, number: int | slice) -> Seen | list[Seen]:
-        """Return the particles of a frame."""
-        if isinstance(number, slice):
-            return [self[each] for each in range(self._count)[number]]
-        if number not in self._kept:
-            self._kept[number] = seen_in(self._read(range(self._count)[number]))
-            self._counts[number] = len(self._kept[number])
-            if len(self._kept) > KEPT_FRAMES:
-                self._kept.popitem(last=False)
-        return self._kept[number]
+    def _seen(self, number: int) -> Seen:
+        found = seen_in(self._read(number))
+        self._counts[number] = len(found)
+        return found
 
     def particles(self, number: int) -> int:
         """Return how many particles a frame has."""
@@ -111,7 +75,7 @@ def stored_tracks(
     provenance: Mapping[str, Any],
     folder: Path,
     found: Trajectories | None = None,
-) -> Iterator[TracksOf[StoredTracks]]:
+) -> Iterator[TracksOf[particle_file.StoredTracks]]:
     """Yield the tracks of a sequence, whose places lie in a folder for as long; as `tracked` in memory.
 
     Raises
@@ -119,10 +83,10 @@ def stored_tracks(
     OutputError : there is no room in the folder
     """
     sequence = tracks_through(frames, chosen, found)
-    with StoredTracks(folder, reference, chosen.attributes(reference), dict(provenance)) as points:
+    with particle_file.StoredTracks(folder, reference, chosen.attributes(reference), dict(provenance)) as points:
         for number in range(len(frames)):
             points.put(sequence.at(number))
-        yield TracksOf(points, TRAJECTORIES_FORMAT, sequence.paths, sequence.summary(), settings)
+        yield TracksOf(points, particle_file.TRAJECTORIES_FORMAT, sequence.paths, sequence.summary(), settings)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -155,10 +119,9 @@ def track_particles(
     *,
     overwrite: bool = False,
     console: Console = CONSOLE,
-    pairs: Pairs | None = None,
 ) -> dict[str, Any]:
-    """Follow particles from frame to frame, in pairs or over a sequence; `pairs`, where they are known already."""
-    batch = Tracks(particles, output, options, overwrite, pairs)
+    """Follow particles from frame to frame, in pairs or over a sequence."""
+    batch = Tracks(particles, output, options, overwrite)
     if options.dry_run:
         return dry_run(batch, options, console)
     worked = work_through(batch, options, console)
@@ -170,7 +133,7 @@ class Outcome:
     """What is told of tracks: their figures, and how good the vectors of each interval are."""
 
     figures: dict[str, Any]
-    qualities: Sequence[Quality]
+    qualities: Sequence[checks.Quality]
     rejected: int
 
 
@@ -188,7 +151,9 @@ class Tracks(PairBatch[Outcome, TrackOptions]):
             groups = self._paired(files, pairs)
             paths = output_paths(output, [group[0].stem for group in groups])
         else:
-            order, self.notices = sequence_of(files)
+            # In the order of time, by names; two are taken as they are given.
+            frames = results_seen(files)
+            order, self.notices = ([0, 1], doubts(frames)) if len(frames) == 2 else in_order(frames)
             groups, paths = [tuple(files[number] for number in order)], [output]
         ensure_frames(len(groups[0]), options.shortest)
         self._groups = groups
@@ -207,27 +172,43 @@ class Tracks(PairBatch[Outcome, TrackOptions]):
         target, paths = self.targets[number], self._groups[number]
         names = [str(path) for path in paths]
         # A pair is read once; of a sequence all that is kept of a frame is its record.
-        read = lru_cache(maxsize=2)(partial(read_points, format_name=PARTICLES_FORMAT))
+        read = lru_cache(maxsize=2)(partial(particle_file.read_points, format_name=particle_file.PARTICLES_FORMAT))
         counts, records = zip(*((frame.count, frame.provenance) for frame in map(read, paths)), strict=True)
         ensure_particles(counts, names)
         settings = settings_of(records, names, self._options.dt_s)
         chosen = tracking_of(settings, self._options.search_voxel, self._options.shortest, len(paths), names[0])
         with _tracks(paths, read, settings, chosen, dict(target.record), target.path.parent) as found:
-            told = {
-                f"{role} {path.name}": made for (role, path), made in zip(_roles(paths).items(), records, strict=True)
-            }
+            roles = zip(_roles(paths).items(), records, strict=True)
+            told = {f"{role} {path.name}": made for (role, path), made in roles}
             doubts = dt_notices(chosen.dt_s, pairwise(records), paths[0].name)
-            few = few_notices(counts, [path.name for path in paths], found.summary, found.points)
-            notices = [*doubts, *calibration_notices(told), *few]
+            few = checks.few_notices(counts, [path.name for path in paths], found.summary, found.points)
+            notices = [*doubts, *checks.calibration_notices(told), *few]
             work.console.warn(notices)
             provenance = with_warnings(found.points.provenance, notices)
             # What is complete is skipped: in the place of what is made there is nothing, or something broken.
             replacing = self.overwrite or self._options.resume
             points = found.points.with_record(provenance)
-            write_points(target.path, found.format_name, points, overwrite=replacing)
-            fields = found.fields() if self._options.by == "polynomials" else _fitted(found, names[0])
-            qualities, rejected = _write_grids(target.beside, fields, points, replacing, work.console)
-            return Outcome(found.summary | _sigmas(found.points), qualities, rejected)
+            particle_file.write_points(target.path, found.format_name, points, overwrite=replacing)
+            if self._options.by == "polynomials":
+                fields = found.fields()
+            else:
+                fields = (each.vectors() for each in fields_of(found, names[0]))
+            qualities, rejected = [], 0
+            for path, field in zip(target.beside, fields if target.beside else (), strict=True):
+                quality = checks.quality_of(field)
+                notices = list(checks.field_notices(quality, path.name))
+                work.console.warn(notices)
+                made = with_warnings(points.provenance, notices)
+                vtkhdf.write_vectors(path, field, points.reference, provenance=made, overwrite=replacing)
+                qualities.append(quality)
+                rejected += int(np.count_nonzero(field.flag >= REJECTED))
+            count, sigmas = found.points.count, found.points.rows("velocity_sigma")
+            sigma = np.concatenate([each[np.isfinite(each).all(axis=1)] for each in sigmas])
+            told_sigmas = {
+                "velocity_sigma_m_s_median": np.median(sigma, axis=0).tolist() if len(sigma) else None,
+                "tracks_without_uncertainty_share": (count - len(sigma)) / count if count else None,
+            }
+            return Outcome(found.summary | told_sigmas, qualities, rejected)
 
     def summary(self, worked: Worked[Outcome]) -> dict[str, Any]:
         """Return what is told of the batch: all figures of a single result, the sums of several."""
@@ -248,23 +229,21 @@ def summary_of(worked: Worked[Outcome], paths: Sequence[Path]) -> dict[str, Any]
     """Return what is told of so many files of tracks."""
     outcomes = list(worked.outcomes.values())
     if len(paths) == 1:
-        told = outcomes[0].figures if outcomes else {"tracks": count_tracks(paths[0]) if paths[0].exists() else 0}
+        told = outcomes[0].figures if outcomes else {"tracks": 0}
+        if not outcomes and paths[0].exists():
+            # Of two frames, or of a sequence, which has a place for each frame of a track.
+            points = particle_file.read_tracks(paths[0])
+            number = points.arrays.get("track")
+            told = {"tracks": len(points.position_mm) if number is None else len(np.unique(number))}
     else:
         tracks = sum(outcome.figures["tracks"] for outcome in outcomes)
         told = {"pairs": len(paths), "skipped": worked.skipped, "tracks": tracks}
     qualities = [quality for outcome in outcomes for quality in outcome.qualities]
     if not qualities:
         return told
-    every = quality_of_all(qualities)
+    every = checks.quality_of_all(qualities)
     rejected = sum(outcome.rejected for outcome in outcomes)
     return told | {"vectors": every.vectors, "rejected": rejected} | every.summary()
-
-
-def count_tracks(path: Path) -> int:
-    """Return how many tracks a file holds, of two frames or of a sequence."""
-    points = read_tracks(path)
-    number = points.arrays.get("track")
-    return len(points.position_mm) if number is None else len(np.unique(number))
 
 
 def grid_paths(output: Path, intervals: int) -> list[Path]:
@@ -283,7 +262,7 @@ def _roles(particles: Sequence[Path]) -> dict[str, Path]:
 @contextmanager
 def _tracks(
     paths: Sequence[Path],
-    read: Callable[[Path], Points],
+    read: Callable[[Path], particle_file.Points],
     settings: Config,
     chosen: Tracking,
     made: dict[str, Any],
@@ -296,34 +275,3 @@ def _tracks(
     frames, reference = SeenFrames(len(paths), lambda number: read(paths[number])), read(paths[0]).reference
     with stored_tracks(frames, reference, settings, chosen, made, folder) as found:
         yield found
-
-
-def _sigmas(tracks: PointRows) -> dict[str, Any]:
-    """Return the median of the tracks' standard deviations, and the share of those without one."""
-    known = [sigma[np.isfinite(sigma).all(axis=1)] for sigma in tracks.rows("velocity_sigma")]
-    sigma = np.concatenate(known)
-    return {
-        "velocity_sigma_m_s_median": np.median(sigma, axis=0).tolist() if len(sigma) else None,
-        "tracks_without_uncertainty_share": (tracks.count - len(sigma)) / tracks.count if tracks.count else None,
-    }
-
-
-def _fitted(found: TracksOf[Any], name: str) -> Iterator[VectorField]:
-    """Yield the vectors of a field fitted to the tracks of each interval."""
-    return (each.vectors() for each in fields_of(found, name))
-
-
-def _write_grids(
-    grids: Sequence[Path], fields: Iterable[VectorField], tracks: PointRows, overwrite: bool, console: Console
-) -> tuple[list[Quality], int]:
-    """Write the vectors of each interval; return how good they are, and how many are rejected."""
-    qualities, rejected = [], 0
-    for target, field in zip(grids, fields if grids else (), strict=True):
-        quality = quality_of(field)
-        notices = list(field_notices(quality, target.name))
-        console.warn(notices)
-        made = with_warnings(tracks.provenance, notices)
-        vtkhdf.write_vectors(target, field, tracks.reference, provenance=made, overwrite=overwrite)
-        qualities.append(quality)
-        rejected += int(np.count_nonzero(field.flag >= REJECTED))
-    return qualities, rejected

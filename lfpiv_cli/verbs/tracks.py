@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, Generic, TypeVar, overload
@@ -16,17 +16,42 @@ from lfpiv_cli.files.particle_file import POSITION, TRACKS_FORMAT, TRAJECTORIES_
 from lfpiv_cli.files.provenance import OF_FRAMES, ensure_agreement, even_step_s, record, seconds_between
 from lfpiv_cli.flow.field import MM_TO_M, VectorField
 from lfpiv_cli.flow.from_tracks import Paths, WindowGrid, vectors_from_paths
+from lfpiv_cli.flow.windows import Walls
 from lfpiv_cli.notice import warn_of
 from lfpiv_cli.reference import Reference
 from lfpiv_cli.scale import Scale
 from lfpiv_cli.tracks.candidates import Light, Seen, Trajectories, long_ones
 from lfpiv_cli.tracks.in_time import Scatter
 from lfpiv_cli.tracks.sequences import SHORTEST, follow, scatter_in, states_at
-from lfpiv_cli.tracks.tracking import SEARCH_LENSES, Tracks, wrong_link_variance
+from lfpiv_cli.tracks.tracking import SEARCH_LENSES, wrong_link_variance
 from lfpiv_cli.tracks.tracking import track as match
 from lfpiv_cli.verbs.checks import few_notices
 
-# The tracks of a sequence, a frame at a time: their states at each frame, and half-way between two.
+Item = TypeVar("Item")
+
+
+class Lazy(Sequence[Item]):
+    """Items that are made when they are asked for."""
+
+    def __init__(self, count: int, make: Callable[[int], Item]) -> None:
+        """Take how many there are, and what makes one."""
+        self._places, self._make = range(count), make
+
+    def __len__(self) -> int:
+        """Return how many there are."""
+        return len(self._places)
+
+    @overload
+    def __getitem__(self, number: int) -> Item: ...
+
+    @overload
+    def __getitem__(self, number: slice) -> list[Item]: ...
+
+    def __getitem__(self, number: int | slice) -> Item | list[Item]:
+        """Return one, or some of them."""
+        if isinstance(number, slice):
+            return [self._make(place) for place in self._places[number]]
+        return self._make(self._places[number])
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,8 +108,13 @@ class SequenceTracks:
 
     @property
     def paths(self) -> Sequence[Paths]:
-        """The tracks that pass from each frame to the next."""
-        return _Paths(self)
+        """The tracks that pass from each frame to the next, those of one interval computed at a time."""
+        return Lazy(len(self.frames) - 1, self._path)
+
+    def _path(self, number: int) -> Paths:
+        """Return the tracks that pass from a frame to the next, half-way between the two."""
+        state = states_at(self.found, self.frames, number + 0.5, self.scatter, self.half_frames)[1]
+        return Paths(state.position_mm, state.velocity, state.velocity_sigma)
 
     def summary(self) -> dict[str, Any]:
         """Return counts and figures, units in their names."""
@@ -101,34 +131,8 @@ class SequenceTracks:
         }
 
 
-class _Paths(Sequence[Paths]):
-    """The paths of tracks in each interval between frames, one computed at a time."""
-
-    def __init__(self, tracks: SequenceTracks) -> None:
-        self._tracks = tracks
-
-    def __len__(self) -> int:
-        return len(self._tracks.frames) - 1
-
-    @overload
-    def __getitem__(self, number: int) -> Paths: ...
-
-    @overload
-    def __getitem__(self, number: slice) -> list[Paths]: ...
-
-    def __getitem__(self, number: int | slice) -> Paths | list[Paths]:
-        if isinstance(number, slice):
-            return [self[each] for each in range(len(self))[number]]
-        tracks, time = self._tracks, range(len(self))[number] + 0.5
-        state = states_at(tracks.found, tracks.frames, time, tracks.scatter, tracks.half_frames)[1]
-        return Paths(state.position_mm, state.velocity, state.velocity_sigma)
-
-
 def track(
-    *particles: Points,
-    dt_s: float | None = None,
-    search_voxel: float | None = None,
-    shortest: int | None = None,
+    *particles: Points, dt_s: float | None = None, search_voxel: float | None = None, shortest: int | None = None
 ) -> Tracked:
     """Follow particles from one frame to the next, or over a sequence of frames.
 
@@ -226,13 +230,8 @@ class TracksOf(Generic[Rows]):
 
     def fields(self) -> Iterator[VectorField]:
         """Yield what `vectors` returns, one at a time."""
-        settings, volume = self.settings, self.settings.grid()
-        windows = WindowGrid(
-            volume,
-            settings.windows_voxel(volume.spacing_mm)[-1],
-            settings.overlap(volume.spacing_mm),
-            settings.masking_walls(),
-        )
+        settings = self.settings
+        windows = windows_of(settings, settings.masking_walls())
         return (vectors_from_paths(paths, windows, settings.correlation.dt_s) for paths in self.paths)
 
 
@@ -240,13 +239,15 @@ class Tracked(TracksOf[Points]):
     """Tracks in memory."""
 
 
-def ensure_frames(frames: int, shortest: int | None) -> None:
-    """Refuse what makes no tracks.
+def windows_of(settings: Config, walls: Walls | None) -> WindowGrid:
+    """Return the final interrogation windows of a config, masked beyond walls."""
+    volume = settings.grid()
+    size, overlap = settings.windows_voxel(volume.spacing_mm)[-1], settings.overlap(volume.spacing_mm)
+    return WindowGrid(volume, size, overlap, walls)
 
-    Raises
-    ------
-    UsageError
-    """
+
+def ensure_frames(frames: int, shortest: int | None) -> None:
+    """Refuse what makes no tracks (UsageError)."""
     if frames < 2:
         raise UsageError("track needs the particles of two frames at least")
     if frames == 2 and shortest is not None:
@@ -254,12 +255,7 @@ def ensure_frames(frames: int, shortest: int | None) -> None:
 
 
 def ensure_particles(counts: Sequence[int], names: Sequence[str]) -> None:
-    """Refuse frames of which not even two hold particles.
-
-    Raises
-    ------
-    InputError
-    """
+    """Refuse frames of which not even two hold particles (InputError)."""
     if np.count_nonzero(counts) < 2:
         empty = [name for name, count in zip(names, counts, strict=True) if not count]
         raise InputError(f"{', '.join(empty)}: no particles; tracks need some in two frames at least")
@@ -319,42 +315,35 @@ def tracked(
 ) -> Tracked:
     """Follow particles from frame to frame; where a sequence has been followed already, `found` says how."""
     reference, told = frames[0].reference, chosen.attributes(frames[0].reference)
-    paths: Sequence[Paths]
-    if chosen.shortest is None:
-        position, arrays, summary, paths = _pair(frames[0], frames[1], chosen)
-        name = TRACKS_FORMAT
-    else:
+    if chosen.shortest is not None:
         sequence = tracks_through([seen_in(frame) for frame in frames], chosen, found)
         arrays, summary, paths = sequence.by_track(), sequence.summary(), sequence.paths
-        position, name = arrays.pop(POSITION), TRAJECTORIES_FORMAT
-    return Tracked(Points(position, arrays, reference, told, provenance), name, paths, summary, settings)
-
-
-Found = tuple[NDArray[np.float64], dict[str, NDArray[Any]], dict[str, Any], list[Paths]]
-
-
-def _pair(first: Points, second: Points, chosen: Tracking) -> Found:
-    """Return places, arrays, summary and paths of particles followed from one frame to the next."""
-    found = match(seen_in(first), seen_in(second), chosen.search_mm, chosen.scale)
-    covariance = _covariance(first, second, found, chosen.scale)
-    start, end = first.position_mm[found.first], second.position_mm[found.second]
-    paths = Paths(0.5 * (start + end), end - start, np.sqrt(covariance[:, :3]))
+        points = Points(arrays.pop(POSITION), arrays, reference, told, provenance)
+        return Tracked(points, TRAJECTORIES_FORMAT, paths, summary, settings)
+    first, second = frames
+    links = match(seen_in(first), seen_in(second), chosen.search_mm, chosen.scale)
+    # (n, 6) of displacements, mm^2: xx, yy, zz, xy, yz, xz.
+    covariance = first.arrays["covariance_mm2"][links.first] + second.arrays["covariance_mm2"][links.second]
+    covariance[:, :3] += wrong_link_variance(links.probability, chosen.scale)
+    start, end = first.position_mm[links.first], second.position_mm[links.second]
+    path = Paths(0.5 * (start + end), end - start, np.sqrt(covariance[:, :3]))
     arrays = {
-        "velocity": paths.displacement_mm * MM_TO_M / chosen.dt_s,
-        "velocity_sigma": paths.sigma_mm * MM_TO_M / chosen.dt_s,
-        "displacement_mm": paths.displacement_mm,
+        "velocity": path.displacement_mm * MM_TO_M / chosen.dt_s,
+        "velocity_sigma": path.sigma_mm * MM_TO_M / chosen.dt_s,
+        "displacement_mm": path.displacement_mm,
         "displacement_covariance_mm2": covariance,
-        "particle_a": found.first,
-        "particle_b": found.second,
-        "link_probability": found.probability,
+        "particle_a": links.first,
+        "particle_b": links.second,
+        "link_probability": links.probability,
     }
     summary = {
         "particles_a": len(first.position_mm),
         "particles_b": len(second.position_mm),
-        "tracks": len(found.first),
-        "expected_wrong_links": float(np.sum(1.0 - found.probability)),
+        "tracks": len(links.first),
+        "expected_wrong_links": float(np.sum(1.0 - links.probability)),
     }
-    return paths.middle_mm, arrays, summary, [paths]
+    points = Points(path.middle_mm, arrays, reference, told, provenance)
+    return Tracked(points, TRACKS_FORMAT, [path], summary, settings)
 
 
 def tracks_through(frames: Sequence[Seen], chosen: Tracking, found: Trajectories | None) -> SequenceTracks:
@@ -377,10 +366,3 @@ def seen_in(frame: Points) -> Seen:
     """Return the particles of a file as tracking takes them."""
     light = Light(frame.arrays["intensity"], frame.arrays.get("intensity_sigma"))
     return Seen(frame.position_mm, frame.arrays["covariance_mm2"], light)
-
-
-def _covariance(first: Points, second: Points, tracks: Tracks, scale: Scale) -> NDArray[np.float64]:
-    """Return the covariances (n, 6) of a pair's displacements, mm^2: xx, yy, zz, xy, yz, xz."""
-    covariance = first.arrays["covariance_mm2"][tracks.first] + second.arrays["covariance_mm2"][tracks.second]
-    covariance[:, :3] += wrong_link_variance(tracks.probability, scale)
-    return np.asarray(covariance)

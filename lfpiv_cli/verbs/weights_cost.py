@@ -8,8 +8,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.calibration.model import Calibration
 from lfpiv_cli.calibration.sheet import check_f_numbers, check_pitch, f_number_notices
 from lfpiv_cli.errors import ConfigError
@@ -18,17 +18,10 @@ from lfpiv_cli.files.inputs import ensure_disk, ensure_room
 from lfpiv_cli.files.weights_file import BYTES_A_VOXEL
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.notice import Notice, written
+from lfpiv_cli.optics import tracing
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.curved_space import CurvedSpace
 from lfpiv_cli.optics.media import Media
-from lfpiv_cli.optics.tracing import (
-    LARGEST_ERROR_PX,
-    ObjectSpace,
-    PolynomialRays,
-    refraction_error_mm,
-    rim_tangent,
-    sine_error_mm,
-)
 from lfpiv_cli.weights.build import separates, strips_of
 from lfpiv_cli.weights.columns import LARGEST_BYTES
 from lfpiv_cli.weights.quadrature import RayCount
@@ -53,11 +46,12 @@ def check_rig(settings: Config, found: Calibration | None) -> None:
     check_f_numbers(sheet)
     if found is not None:
         check_pitch(found.fit, settings.micro_image_pitch_px())
-    if settings.weights.method != "dlfc" and rim_tangent(sheet) > LARGEST_TANGENT:
+    if settings.weights.method != "dlfc" and tracing.rim_tangent(sheet) > LARGEST_TANGENT:
         raise ConfigError(
-            f"camera.main_lens.aperture_mm: the rim of the lens is seen under a tangent of {rim_tangent(sheet):.2f} "
-            f"(NA {_na(sheet):.2f}) from the focal point, at most {LARGEST_TANGENT:g} may be with traced rays; boards "
-            "at several depths and weights.method: dlfc fit the rays of such an objective"
+            "camera.main_lens.aperture_mm: the rim of the lens is seen under a tangent of "
+            f"{tracing.rim_tangent(sheet):.2f} (NA {_na(sheet):.2f}) from the focal point, at most {LARGEST_TANGENT:g} "
+            "may be with traced rays; boards at several depths and weights.method: dlfc fit the rays of such an "
+            "objective"
         )
 
 
@@ -69,57 +63,48 @@ def rig_notices(
     depths = np.linspace(*grid.bounds_mm(2), DEPTHS)
     if isinstance(source, CurvedSpace):
         return [*notices, *_of_sines(camera, source.media, seen_depths_mm(camera, source, grid))]
-    if not isinstance(source, ObjectSpace):
+    if not isinstance(source, tracing.ObjectSpace):
         return notices
-    return [
-        *notices,
-        *_of_refraction(settings, found, camera, source, depths),
-        *_of_sines(camera, source.media, depths),
-    ]
+    if source.refraction != "exact" and source.media != source.media.in_air():
+        try:
+            window = settings.window_model(found.mid_plane_z_mm if found else None)
+        except ConfigError:
+            window = None
+        error_px = tracing.refraction_error_mm(camera, source.media, window, depths) / camera.pixel_mm
+        if error_px > tracing.LARGEST_ERROR_PX:
+            text = (
+                "is paraxial, and Snell's law moves light at the rim of the aperture by "
+                f"{'' if window else 'at least '}{written(error_px, 2)} px on the array, at most "
+                f"{tracing.LARGEST_ERROR_PX:g} px without harm"
+            )
+            remedy = "--refraction exact" if window else "give the section window, or channel, and --refraction exact"
+            limit = f"at most {tracing.LARGEST_ERROR_PX:g} px"
+            notices.append(Notice("paraxial-refraction", "weights.refraction", text, remedy, error_px, limit))
+    return [*notices, *_of_sines(camera, source.media, depths)]
 
 
-def _of_refraction(
-    settings: Config, found: Calibration | None, camera: Camera, source: ObjectSpace, depths: NDArray[np.float64]
-) -> Iterator[Notice]:
-    if source.refraction == "exact" or source.media == source.media.in_air():
-        return
-    try:
-        window = settings.window_model(found.mid_plane_z_mm if found else None)
-    except ConfigError:
-        window = None
-    error_px = refraction_error_mm(camera, source.media, window, depths) / camera.pixel_mm
-    if error_px <= LARGEST_ERROR_PX:
-        return
-    least = "" if window else "at least "
-    remedy = "--refraction exact" if window else "give the section window, or channel, and --refraction exact"
-    yield Notice(
-        "paraxial-refraction",
-        "weights.refraction",
-        f"is paraxial, and Snell's law moves light at the rim of the aperture by {least}{written(error_px, 2)} px on "
-        f"the array, at most {LARGEST_ERROR_PX:g} px without harm",
-        remedy,
-        error_px,
-        f"at most {LARGEST_ERROR_PX:g} px",
-    )
-
-
-def _of_sines(camera: Camera, media: Media, depths: NDArray[np.float64]) -> Iterator[Notice]:
-    error_px = sine_error_mm(camera, media, depths) / camera.pixel_mm
-    if error_px <= LARGEST_ERROR_PX:
+def _of_sines(camera: Camera, media: Media, depths: Floats) -> Iterator[Notice]:
+    error_px = tracing.sine_error_mm(camera, media, depths) / camera.pixel_mm
+    if error_px <= tracing.LARGEST_ERROR_PX:
         return
     text = (
         f"NA {_na(camera):.2f}: the rays of a thin lens are off by {written(error_px, 2)} px on the array at the "
-        f"volume's faces, at most {LARGEST_ERROR_PX:g} px without harm; depths will be wrong"
+        f"volume's faces, at most {tracing.LARGEST_ERROR_PX:g} px without harm; depths will be wrong"
     )
     remedy = "a smaller aperture or a thinner volume, or boards at several depths and weights.method: dlfc"
     yield Notice(
-        "paraxial-lens", "camera.main_lens.aperture_mm", text, remedy, error_px, f"at most {LARGEST_ERROR_PX:g} px"
+        "paraxial-lens",
+        "camera.main_lens.aperture_mm",
+        text,
+        remedy,
+        error_px,
+        f"at most {tracing.LARGEST_ERROR_PX:g} px",
     )
 
 
 def _na(camera: Camera) -> float:
     """Return the numerical aperture towards the scene, in air."""
-    tangent = rim_tangent(camera)
+    tangent = tracing.rim_tangent(camera)
     return float(tangent / np.hypot(1.0, tangent))
 
 
@@ -185,13 +170,9 @@ def cost_of(settings: Config, camera: Camera, source: Source, grid: Grid) -> Cos
     entries = ENTRIES_PER_PIXEL * float(camera.micro_image_lattice_px().pitch.mean())
     both_axes, pixel_bytes = planes * (strips * columns + rows) * entries, FLOAT_BYTES * pixels
     products = planes * rows * entries * (columns + camera.columns)
-    return Cost(
-        voxels,
-        both_axes * ENTRY_BYTES + pixel_bytes,
-        both_axes * ENTRY_S + pixels * MASK_PIXEL_S,
-        held + both_axes * ENTRY_BYTES + pixel_bytes,
-        projections * products / MULTIPLICATIONS_PER_S,
-    )
+    weights_bytes, weights_s = both_axes * ENTRY_BYTES + pixel_bytes, both_axes * ENTRY_S + pixels * MASK_PIXEL_S
+    image_bytes, image_s = held + both_axes * ENTRY_BYTES + pixel_bytes, projections * products / MULTIPLICATIONS_PER_S
+    return Cost(voxels, weights_bytes, weights_s, image_bytes, image_s)
 
 
 def ensure_fits(cost: Cost, output: Path) -> None:
@@ -233,11 +214,6 @@ def _strips(camera: Camera, source: Source, grid: Grid) -> float:
     return float(separates(camera, source, grid))
 
 
-def particles_core_s(tracers: float) -> float:
-    """Return what finding the particles of each image of so many tracers will take, in seconds of a core."""
-    return TRACER_S * tracers
-
-
 def held_bytes(voxels: int, pixels: int) -> float:
     """Return what a solver holds in memory besides the weights, for a volume, padding included, and an image."""
     return FLOAT_BYTES * (VOLUMES_HELD * voxels + IMAGES_HELD * pixels)
@@ -248,21 +224,8 @@ def columns_bytes(voxels: int) -> float:
     return float(min(voxels * COLUMN_BYTES, LARGEST_BYTES))
 
 
-def on_demand_told(voxels: int) -> str:
-    """Return what volumes will take whose columns are made on demand, in words."""
-    return (
-        f"columns are made on demand: up to {written(voxels * COLUMN_S / 60.0, 2)} minutes of a core for each image, "
-        f"where all {written(voxels)} voxels can be lit"
-    )
-
-
 def check_rays(settings: Config, source: Source, grid: Grid) -> None:
-    """Refuse to count more rays for a grid, padding included, than there is time for.
-
-    Raises
-    ------
-    ConfigError
-    """
+    """Refuse to count more rays for a grid, padding included, than there is time for (ConfigError)."""
     rays, voxels = _rays(settings, source, grid), math.prod(grid.shape_xyz)
     if rays > MOST_RAYS:
         raise ConfigError(
@@ -275,7 +238,7 @@ def check_rays(settings: Config, source: Source, grid: Grid) -> None:
 def _rays(settings: Config, source: Source, grid: Grid) -> int:
     """Return how many rays are to be counted for a grid, 0 where weights are integrals."""
     chosen = settings.weights
-    if chosen.sampling == "exact" or isinstance(source, PolynomialRays):
+    if chosen.sampling == "exact" or isinstance(source, tracing.PolynomialRays):
         return 0
     return math.prod(grid.shape_xyz) * RayCount(chosen.points, chosen.rays_per_point).rays
 
@@ -291,13 +254,6 @@ def cost_notices(cost: Cost) -> list[Notice]:
         f"{written(cost.image_core_s / 60.0, 2)} minutes of a core"
     )
     remedy = "a smaller volume or larger voxels; --dry-run tells what others will take"
-    return [
-        Notice(
-            "heavy-work",
-            "volume",
-            text,
-            remedy,
-            max(cost.weights_core_s / LONG_S, most / MUCH_BYTES),
-            f"at most {LONG_S / 60.0:g} minutes for the weights and {MUCH_BYTES / 1e9:g} GB",
-        )
-    ]
+    share = max(cost.weights_core_s / LONG_S, most / MUCH_BYTES)
+    expected = f"at most {LONG_S / 60.0:g} minutes for the weights and {MUCH_BYTES / 1e9:g} GB"
+    return [Notice("heavy-work", "volume", text, remedy, share, expected)]

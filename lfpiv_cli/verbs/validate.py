@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.console import CONSOLE, Console
 from lfpiv_cli.errors import ConfigError, InputError, LimitMissedError, UsageError
 from lfpiv_cli.files import vtkhdf
@@ -18,45 +19,24 @@ from lfpiv_cli.files.inputs import given
 from lfpiv_cli.files.pages import ensure_drawing, write_picture
 from lfpiv_cli.files.particles import MM_PER_M, read_particles
 from lfpiv_cli.files.provenance import record
-from lfpiv_cli.files.provenance import record as provenance_record
 from lfpiv_cli.files.sections_simulated import FlowSection
 from lfpiv_cli.flow.field import VectorField
 from lfpiv_cli.flow.windows import RoundWall
 from lfpiv_cli.names import Moment
 from lfpiv_cli.notice import Notice
+from lfpiv_cli.optics.curved_space import CurvedSpace
 from lfpiv_cli.optics.tracing import ObjectSpace
-from lfpiv_cli.reference import Reference
-from lfpiv_cli.stages.validate_board import depths_in_volume, validate_board
 from lfpiv_cli.synthetic.flows import Flow
+from lfpiv_cli.validation import methods as of_methods
+from lfpiv_cli.validation import weights as of_weights
 from lfpiv_cli.validation.flow import Duct, Measured, limits_missed, truth_at_points
-from lfpiv_cli.validation.methods import (
-    errors_figure,
-    flow_figure,
-    lower_error,
-    profiles_figure,
-    radius_figure,
-    slices_figure,
-)
 from lfpiv_cli.validation.volume import volume_figures
-from lfpiv_cli.validation.weights import (
-    SHOWN,
-    SHOWN_BEHIND_FACES,
-    TABLE1_MM,
-    columns_figure,
-    judged_voxels,
-    make_columns,
-    similarity_figure,
-    weights_figures,
-    weights_limits_missed,
-)
-from lfpiv_cli.verbs.chain import run_chain
+from lfpiv_cli.verbs.chain import measure_images, simulate_images
 from lfpiv_cli.verbs.simulate import ensure_experiment
+from lfpiv_cli.verbs.validate_board import depths_in_volume, validate_board
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-
-# The stage of `validate volume`: a reconstructed volume against the particles that were there.
 
 
 # When the frames of a pair are taken, in units of the time between them, counted from the middle of the pair.
@@ -111,19 +91,27 @@ def validate_weights(
     camera, grid = settings.camera_model(), settings.grid()
     rng = np.random.default_rng(chosen.seed)
     scene = settings.scene_space()
-    space = _space(settings) if scene is None else scene
-    centres, counted = judged_voxels(camera, space, grid, chosen.sample, rng)
+    space: ObjectSpace | CurvedSpace
+    if scene is not None:
+        space = scene
+    else:
+        try:
+            window = settings.window_model()
+        except ConfigError:
+            window = None  # there is nothing to trace directly
+        space = ObjectSpace(settings.media_model(), window)
+    centres, counted = of_weights.judged_voxels(camera, space, grid, chosen.sample, rng)
     long_count = np.where(counted, chosen.long_count_rays, 0)
     with console.progress(len(centres), "validate weights") as advance:
-        columns = make_columns(camera, space, grid, centres, rng, long_count, advance)
-    figures = weights_figures(columns, long_count)
-    missed = weights_limits_missed(figures, chosen.limits.model_dump())
-    record = provenance_record("validate weights", settings.resolved(), {"config": config})
-    write_json(paths[".json"], {"figures": figures, "limits_missed": missed, "provenance": record}, overwrite)
-    shown = min(len(TABLE1_MM), len(columns))
-    names = SHOWN if scene is None else SHOWN_BEHIND_FACES
-    write_picture(paths["_columns.png"], columns_figure(columns[:shown], names), overwrite)
-    write_picture(paths["_similarity.png"], similarity_figure(figures, shown), overwrite)
+        columns = of_weights.make_columns(camera, space, grid, centres, rng, long_count, advance)
+    figures = of_weights.weights_figures(columns, long_count)
+    missed = of_weights.weights_limits_missed(figures, chosen.limits.model_dump())
+    provenance = record("validate weights", settings.resolved(), {"config": config})
+    write_json(paths[".json"], {"figures": figures, "limits_missed": missed, "provenance": provenance}, overwrite)
+    shown = min(len(of_weights.TABLE1_MM), len(columns))
+    names = of_weights.SHOWN if scene is None else of_weights.SHOWN_BEHIND_FACES
+    write_picture(paths["_columns.png"], of_weights.columns_figure(columns[:shown], names), overwrite)
+    write_picture(paths["_similarity.png"], of_weights.similarity_figure(figures, shown), overwrite)
     summary = {
         f"{name}.{figure}": each[figure]
         for name, each in figures.items()
@@ -135,19 +123,10 @@ def validate_weights(
     return {"voxels": len(columns)} | summary
 
 
-def _space(settings: Config) -> ObjectSpace:
-    """Return media and window; without the section `window` there is nothing to trace directly."""
-    try:
-        window = settings.window_model()
-    except ConfigError:
-        window = None
-    return ObjectSpace(settings.media_model(), window)
-
-
 PICTURES: dict[str, Callable[[Mapping[str, Measured]], Figure]] = {
-    "flow.png": flow_figure,
-    "flow_errors.png": errors_figure,
-    "flow_profiles.png": profiles_figure,
+    "flow.png": of_methods.flow_figure,
+    "flow_errors.png": of_methods.errors_figure,
+    "flow_profiles.png": of_methods.profiles_figure,
 }
 # Of a square duct, and of a round pipe.
 SLICES, RADII = "flow_slices.png", "flow_radii.png"
@@ -172,7 +151,6 @@ def validate_flow(
     is_simulated = vectors is None
     if is_simulated and particles is not None:
         raise UsageError("--particles needs --vectors: the flow of a simulation is known")
-    paths = {name: output / name for name in ("flow.json", *PICTURES, SLICES, RADII)}
     settings = load_config(config)
     if is_simulated:
         ensure_experiment(settings)
@@ -180,18 +158,22 @@ def validate_flow(
     named = settings.simulation.flow if is_simulated else settings.validation.flow or settings.simulation.flow
     duct, pipe = duct_of(named), named if named is not None and named.kind == "pipe" else None
     walls = None if pipe is None else RoundWall(pipe.radius_mm, pipe.centre_mm, pipe.axis)
-    if duct is None:
-        del paths[SLICES]
-    if pipe is None:
-        del paths[RADII]
+    drawn = [*PICTURES, *([] if duct is None else [SLICES]), *([] if pipe is None else [RADII])]
+    paths = {name: output / name for name in ("flow.json", *drawn)}
     for target in paths.values():
         ensure_writable(target, overwrite, given(config=config, vectors=vectors, particles=particles).values())
     ensure_drawing()
-    made = {"measured": vectors} if vectors else run_chain(config, output, overwrite=overwrite, console=console)
+    if vectors:
+        made = {"measured": vectors}
+    else:
+        # With all imperfections on, which every method gets alike; of a longer sequence the first two images.
+        simulate_images(config, output / "images", overwrite=overwrite, console=console)
+        made = measure_images(config, output / "images", output, overwrite=overwrite, console=console)
     inputs = given(config=config, particles=particles) | (given(vectors=vectors) if vectors else made)
     methods = {name: measured_of(path, settings, particles, is_simulated) for name, path in made.items()}
     if particles and named is not None and methods["measured"].flow is None:
-        console.warn([_other_flow(config, particles)])
+        text = f"the particles of {particles.name} do not move as the flow that it names, and are taken for the truth"
+        console.warn([Notice("truth-contradicts", config.name, text, "validation.flow of this experiment, or none")])
     truth = "analytic flow" if all(measured.flow for measured in methods.values()) else "particles"
     figures = {name: measured.figures(duct, walls) for name, measured in methods.items()}
     limits = settings.validation.limits.model_dump()
@@ -206,16 +188,16 @@ def validate_flow(
         "truth": truth,
     }
     if len(methods) > 1:
-        report["lower_error"] = lower_error(methods, figures)
+        report["lower_error"] = of_methods.lower_error(methods, figures)
     report["provenance"] = record("validate flow", settings.resolved(), inputs)
     write_json(paths["flow.json"], report, overwrite)
     for name, draw in PICTURES.items():
         write_picture(paths[name], draw(methods), overwrite)
     if duct is not None:
-        write_picture(paths[SLICES], slices_figure(methods, duct), overwrite)
+        write_picture(paths[SLICES], of_methods.slices_figure(methods, duct), overwrite)
     if pipe is not None and walls is not None:
         fields = {name: measured.field for name, measured in methods.items()}
-        write_picture(paths[RADII], radius_figure(fields, walls, pipe.mean_velocity_m_s), overwrite)
+        write_picture(paths[RADII], of_methods.radius_figure(fields, walls, pipe.mean_velocity_m_s), overwrite)
     summary = _summary(figures) if is_simulated else _scalars(figures["measured"])
     summary["truth"] = truth
     if len(methods) > 1:
@@ -238,38 +220,25 @@ def measured_of(vectors: Path, settings: Config, particles: Path | None, is_simu
     if field.dt_s is None:
         raise InputError(f"{vectors}: holds displacements without a time; correlate again with --dt-s")
     if particles:
-        return _beside_particles(field, vtkhdf.read_header(vectors).reference, settings, particles)
+        # Judged where there are particles, with the config's flow if these follow it, else with theirs.
+        reference = vtkhdf.read_header(vectors).reference
+        truth, inside = _truth_of_particles(particles, reference.points_to_focal_point(field.grid.centres_mm()))
+        if settings.validation.flow is None and settings.simulation.flow is None:
+            return Measured(field, truth, inside)
+        flow, true = settings.true_flow(), read_particles(particles)
+        difference = flow(reference.points_from_focal_point(true.positions_mm)) - true.velocities_m_s
+        if np.linalg.norm(difference) > SAME_FLOW * np.linalg.norm(true.velocities_m_s):
+            return Measured(field, truth, inside)
+        analytic = _at_windows(flow, field)
+        return Measured(field, analytic, inside & analytic.any(axis=-1), flow)
     flow = settings.simulated_flow() if is_simulated else settings.true_flow()
     truth = _at_windows(flow, field)
     return Measured(field, truth, np.asarray(truth.any(axis=-1)), flow)
 
 
-def _at_windows(flow: Flow, field: VectorField) -> NDArray[np.float64]:
+def _at_windows(flow: Flow, field: VectorField) -> Floats:
     centres = field.grid.centres_mm()
     return flow(centres.reshape(-1, 3)).reshape(centres.shape)
-
-
-def _beside_particles(field: VectorField, reference: Reference, settings: Config, particles: Path) -> Measured:
-    """Return vectors, judged where there are particles, with the config's flow if these follow it, else with theirs."""
-    centres = reference.points_to_focal_point(field.grid.centres_mm())
-    truth, inside = _truth_of_particles(particles, centres)
-    if settings.validation.flow is None and settings.simulation.flow is None:
-        return Measured(field, truth, inside)
-    flow, true = settings.true_flow(), read_particles(particles)
-    difference = flow(reference.points_from_focal_point(true.positions_mm)) - true.velocities_m_s
-    if np.linalg.norm(difference) > SAME_FLOW * np.linalg.norm(true.velocities_m_s):
-        return Measured(field, truth, inside)
-    analytic = _at_windows(flow, field)
-    return Measured(field, analytic, inside & analytic.any(axis=-1), flow)
-
-
-def _other_flow(config: Path, particles: Path) -> Notice:
-    return Notice(
-        "truth-contradicts",
-        config.name,
-        f"the particles of {particles.name} do not move as the flow that it names, and are taken for the truth",
-        "validation.flow of this experiment, or none",
-    )
 
 
 def light_notices(settings: Config) -> list[Notice]:
@@ -294,7 +263,7 @@ def _summary(figures: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
     return {name: {method: found[name] for method, found in figures.items()} for name in names}
 
 
-def _truth_of_particles(path: Path, centres_mm: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+def _truth_of_particles(path: Path, centres_mm: Floats) -> tuple[Floats, NDArray[np.bool_]]:
     """Return the true velocities at the window centres, z from the focal point, and which lie among the particles."""
     particles = read_particles(path)
     lit = particles.brightness[:, np.newaxis] > 0.0
@@ -327,12 +296,7 @@ def validate_all(config: Path, output: Path, *, overwrite: bool = False, console
 
 
 def ensure_complete(config: Path) -> None:
-    """Refuse a config that lacks what the last of the reports needs before the first is made.
-
-    Raises
-    ------
-    ConfigError
-    """
+    """Refuse a config that lacks what the last of the reports needs before the first is made (ConfigError)."""
     settings = load_config(config)
     depths_in_volume(settings)
     ensure_experiment(settings)

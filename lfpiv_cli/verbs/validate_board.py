@@ -21,23 +21,13 @@ from lfpiv_cli.files.pages import ensure_drawing, write_picture
 from lfpiv_cli.files.provenance import record
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.tracing import ObjectSpace
-from lfpiv_cli.optics.waves import Waves
 from lfpiv_cli.reconstruction.equations import normalisers
 from lfpiv_cli.reconstruction.images import Image, Mask, light
 from lfpiv_cli.reconstruction.solvers import ALL_ITERATIONS, Reconstruction, reconstruct
 from lfpiv_cli.synthetic.board import BoardPlacement, dot_centres, render_board
-from lfpiv_cli.synthetic.scenes import Misalignment, RecordingCamera, simulate_board, simulate_white
-from lfpiv_cli.synthetic.sensor import Readout
-from lfpiv_cli.validation.board import (
-    DEPTHS_MM,
-    PAPER,
-    DotFigures,
-    board_figure,
-    board_figures,
-    measure_dots,
-    place_figures,
-)
-from lfpiv_cli.verbs.simulate import misalignment_of, readout_of
+from lfpiv_cli.synthetic.scenes import RecordingCamera, simulate_board, simulate_white
+from lfpiv_cli.validation import board as of_boards
+from lfpiv_cli.verbs.simulate import misalignment_of, placement_of, readout_of
 from lfpiv_cli.weights.build import factorise_through, scene_distortion
 from lfpiv_cli.weights.columns import operator_of
 from lfpiv_cli.weights.model import Weights
@@ -83,65 +73,6 @@ class BoardBench:
         return replace(self, weights=replace(self.weights, solver_operator=operator, scene_distortion_per_mm2=None))
 
 
-def ideal_bench(rig: Rig, grid: Grid, level: float, rng: np.random.Generator) -> BoardBench:
-    """Return the data sheet's camera, `level` expected counts in a pixel that sees only what is bright."""
-    space = ObjectSpace(rig.media, None, "paraxial")
-    weights = Weights(grid, (0, 0, 0), factorise_through(rig.camera, space, grid), rig.camera.column_axis)
-
-    def picture(placement: BoardPlacement) -> Image:
-        return render_board(rig.camera, space, rig.board, placement, level, rng).astype(np.float32)
-
-    return BoardBench(rig, weights, picture, np.zeros(weights.image_shape, np.bool_))
-
-
-@dataclass(frozen=True)
-class Reality:
-    """How a real bench is other than its data sheets say.
-
-    Attributes
-    ----------
-    misalignment : of the camera
-    readout : of its sensor, with noise
-    space : what lies before the lens
-    waves : what light is made of; rays where there are none
-    """
-
-    misalignment: Misalignment
-    readout: Readout
-    space: ObjectSpace
-    waves: Waves | None = None
-
-
-def recorded_bench(
-    rig: Rig, assumed: ObjectSpace, reality: Reality, grid: Grid, level: float, rng: np.random.Generator
-) -> BoardBench:
-    """Return a camera that departs from its data sheet, calibrated from pictures that it took.
-
-    Parameters
-    ----------
-    rig : as the data sheets have it
-    assumed : what is taken to lie before the lens, for the weights
-    level : expected counts in a pixel that sees only what is bright
-    """
-    real = RecordingCamera(reality.misalignment.apply(rig.camera), reality.readout, reality.waves)
-    dark = real.dark_frame(rng)
-    white = simulate_white(real, level, rng).image
-    board = replace(rig.board, medium="air")
-    air = ObjectSpace(rig.media.in_air(), None, "paraxial")
-    snapshot = simulate_board(real, air, board, BoardPlacement(CALIBRATION_BOARD_Z_MM), level, rng).image
-    calibration = calibrate(Photographs([white], dark, snapshot), replace(rig, board=board))
-    camera = calibration.camera(rig.camera)
-    bend = scene_distortion(camera, rig.media, grid)
-    operator = factorise_through(camera, assumed, grid)
-    weights = Weights(grid, (0, 0, 0), operator, camera.column_axis, calibration, bend)
-
-    def picture(placement: BoardPlacement) -> Image:
-        recorded = simulate_board(real, reality.space, rig.board, placement, level, rng).image
-        return weights.prepare(light(recorded.astype(np.float32), dark.astype(np.float32)))
-
-    return BoardBench(replace(rig, camera=camera), weights, picture, ~calibration.rectification.inside)
-
-
 BoardSolver = Callable[[NDArray[np.float32], Callable[[int], None]], Reconstruction]
 
 # Two make a step in depth, a third the polynomials of fitted rays.
@@ -178,9 +109,11 @@ def validate_board(
                     continue
                 judged = bench if method == "ert" else bench.with_fitted_rays(pictures, depths)
                 dots, drawn = _boards(judged, pictures, depths, settings, console, advance)
-                measured = board_figures(dots, depths, bench.rig.board.dots, bench.rig.board.spacing_mm)
-                figures[half][method] = measured | {"paper": PAPER[half, method]}
-                write_picture(drawings[half, method], board_figure(measured, drawn, settings.grid()), overwrite)
+                measured = of_boards.board_figures(dots, depths, bench.rig.board.dots, bench.rig.board.spacing_mm)
+                figures[half][method] = measured | {"paper": of_boards.PAPER[half, method]}
+                write_picture(
+                    drawings[half, method], of_boards.board_figure(measured, drawn, settings.grid()), overwrite
+                )
     provenance = record("validate board", settings.resolved(), {"config": config})
     write_json(report, {"figures": figures, "provenance": provenance}, overwrite)
     return {
@@ -193,14 +126,9 @@ def validate_board(
 
 
 def depths_in_volume(settings: Config) -> tuple[float, ...]:
-    """Return those of the paper's depths that lie in the volume.
-
-    Raises
-    ------
-    ConfigError : they are too few
-    """
+    """Return those of the paper's depths that lie in the volume (ConfigError: they are too few)."""
     low, high = settings.grid().bounds_mm(2)
-    depths = tuple(depth for depth in DEPTHS_MM if low < depth < high)
+    depths = tuple(depth for depth in of_boards.DEPTHS_MM if low < depth < high)
     if len(depths) < FEWEST_DEPTHS:
         raise ConfigError(
             f"{settings.source}: volume: reaches from z = {low:g} to {high:g} mm and holds {len(depths)} of the "
@@ -209,22 +137,40 @@ def depths_in_volume(settings: Config) -> tuple[float, ...]:
     return depths
 
 
-def placement_of(settings: Config, depth_mm: float) -> BoardPlacement:
-    """Return where the simulated board stands at a depth."""
-    scene = settings.simulation
-    return BoardPlacement(depth_mm, scene.board_offset_mm, scene.board_tilt_deg, scene.board_rotation_deg)
-
-
 def bench_of(settings: Config, half: str) -> BoardBench:
-    """Return the camera before which the boards of a half of Table 3 are held."""
-    scene = settings.simulation
+    """Return the camera before which the boards of a half of Table 3 are held.
+
+    The ideal one is the data sheet's; the other one departs from it, and is calibrated from pictures that it took.
+    """
+    scene, level = settings.simulation, settings.simulation.peak_counts
     settings.ensure_plane_layers("validating boards")
     rig, grid, rng = settings.rig(), settings.grid(), np.random.default_rng(scene.seed)
     if half == "ideal":
-        return ideal_bench(rig, grid, scene.peak_counts, rng)
-    true = ObjectSpace(rig.media, settings.window_model(), scene.refraction)
-    reality = Reality(misalignment_of(settings), readout_of(settings), true, scene.light.waves())
-    return recorded_bench(rig, settings.plane_space("validating boards"), reality, grid, scene.peak_counts, rng)
+        paraxial = ObjectSpace(rig.media, None, "paraxial")
+        weights = Weights(grid, (0, 0, 0), factorise_through(rig.camera, paraxial, grid), rig.camera.column_axis)
+
+        def ideal_picture(placement: BoardPlacement) -> Image:
+            return render_board(rig.camera, paraxial, rig.board, placement, level, rng).astype(np.float32)
+
+        return BoardBench(rig, weights, ideal_picture, np.zeros(weights.image_shape, np.bool_))
+    space = ObjectSpace(rig.media, settings.window_model(), scene.refraction)
+    assumed = settings.plane_space("validating boards")
+    real = RecordingCamera(misalignment_of(settings).apply(rig.camera), readout_of(settings), scene.light.waves())
+    dark = real.dark_frame(rng)
+    white = simulate_white(real, level, rng).image
+    board = replace(rig.board, medium="air")
+    air = ObjectSpace(rig.media.in_air(), None, "paraxial")
+    snapshot = simulate_board(real, air, board, BoardPlacement(CALIBRATION_BOARD_Z_MM), level, rng).image
+    calibration = calibrate(Photographs([white], dark, snapshot), replace(rig, board=board))
+    camera = calibration.camera(rig.camera)
+    bend, operator = scene_distortion(camera, rig.media, grid), factorise_through(camera, assumed, grid)
+    calibrated = Weights(grid, (0, 0, 0), operator, camera.column_axis, calibration, bend)
+
+    def picture(placement: BoardPlacement) -> Image:
+        recorded = simulate_board(real, space, rig.board, placement, level, rng).image
+        return calibrated.prepare(light(recorded.astype(np.float32), dark.astype(np.float32)))
+
+    return BoardBench(replace(rig, camera=camera), calibrated, picture, ~calibration.rectification.inside)
 
 
 def _discs(
@@ -241,7 +187,7 @@ def _discs(
         places.append(dots_in_world(picture, rig.camera, rig.board, rig.media, rotation))
         advance(1)
     x, z = ([each[..., axis] for each in places] for axis in (0, 2))
-    return place_figures(x, z, depths_mm, rig.board.spacing_mm)
+    return of_boards.place_figures(x, z, depths_mm, rig.board.spacing_mm)
 
 
 def _boards(
@@ -251,7 +197,7 @@ def _boards(
     settings: Config,
     console: Console,
     advance: Callable[[int], None],
-) -> tuple[list[DotFigures], NDArray[np.float32]]:
+) -> tuple[list[of_boards.DotFigures], NDArray[np.float32]]:
     """Return what is measured of the boards in pictures at all depths, and the volume of the one in the focal plane."""
     board = settings.rig().board
     solve = board_solver(bench, settings)
@@ -260,7 +206,7 @@ def _boards(
         result = solve(picture, advance)
         volume = bench.weights.to_world(result.volume)
         centres = dot_centres(board, placement_of(settings, depth))[:, :2]
-        dots.append(measure_dots(volume, bench.weights.grid, centres, 0.5 * board.spacing_mm))
+        dots.append(of_boards.measure_dots(volume, bench.weights.grid, centres, 0.5 * board.spacing_mm))
         drawn = volume if depth == 0.0 else drawn
         console.detail(f"board at {depth:+z.0f} mm: residual {result.residual[-1]:z.3f}")
     return dots, drawn
