@@ -13,8 +13,13 @@ import pytest
 import yaml
 
 import lfpiv_cli
+from lfpiv_cli.files import images
+from lfpiv_cli.files.recordings.recording import Recording
 from lfpiv_cli.files.sections import Section
 from lfpiv_cli.files.sections_simulated import flow_of
+from lfpiv_cli.flow.correlation import correlate
+from lfpiv_cli.flow.windows import WEIGHTINGS, CorrelationSettings
+from lfpiv_cli.grid import Grid
 from lfpiv_cli.reconstruction.registry import SOLVERS, Solver
 from lfpiv_cli.reconstruction.solvers import SolverSettings, reconstruct
 from lfpiv_cli.reference import Reference
@@ -83,6 +88,16 @@ def test_guide_lists_files_and_tests_for_each_addition():
         assert any(path.startswith("tests/") for path in paths), section.splitlines()[0]
 
 
+@pytest.mark.parametrize(
+    "title",
+    ["A solver", "A kind of surface", "A window weighting", "A format of a camera's frames", "A figure in a report"],
+)
+def test_what_is_added_most_touches_four_files(title: str) -> None:
+    section = GUIDE.split(f"\n### {title}\n", 1)[1].split("\n### ", 1)[0]
+    touched = {match.group(1) for match in PLACE.finditer(section) if match.group(1).startswith("lfpiv_cli/")}
+    assert 1 <= len(touched) <= 4, touched
+
+
 class Pixels:
     """Two voxels, each of which lights its own pixel."""
 
@@ -105,6 +120,32 @@ def test_a_solver_is_added_by_its_step_and_its_name(monkeypatch):
     start = reconstruct(Pixels(), np.array([[4.0, 2.0]], np.float32), SolverSettings("halve", 0))
     np.testing.assert_array_equal(result.volume, start.volume / 8)
     assert result.residual.shape == (4,)
+
+
+def test_a_weighting_is_added_by_its_function_and_its_name(monkeypatch):
+    def triangle(offset):
+        return 1.0 - 2.0 * np.abs(offset)
+
+    monkeypatch.setitem(WEIGHTINGS, "triangle", triangle)
+    a, b = np.random.default_rng(3).random((2, 12, 12, 12)).astype(np.float32)
+    b[:, :, 1:] = a[:, :, :-1]
+    found, grid = {}, Grid.centred((12, 12, 12), (1.0, 1.0, 1.0), (0.0, 0.0, 0.0))
+    for weighting in ("uniform", "triangle"):
+        settings = CorrelationSettings(((8, 8, 8),), (0.5, 0.5, 0.5), 1.0, 1.0, weighting)
+        found[weighting] = correlate([(a, b)], grid, settings).displacement_voxel
+        np.testing.assert_allclose(np.nanmedian(found[weighting][..., 0]), 1.0, atol=0.05)
+    assert not np.array_equal(found["uniform"], found["triangle"])
+
+
+def test_a_camera_format_is_added_by_its_reader_and_its_line(monkeypatch, tmp_path):
+    image = np.arange(12, dtype=np.float32).reshape(3, 4)
+
+    def frames(path):
+        return Recording(1, image.shape, 16, lambda page, shape: image)
+
+    monkeypatch.setattr(images, "FORMATS", (images.Format("text", frames, suffixes=(".text",)), *images.FORMATS))
+    (tmp_path / "a.text").write_text("an image")
+    np.testing.assert_array_equal(images.read_image(tmp_path / "a.text"), image)
 
 
 class Expansion(Section):
