@@ -130,6 +130,13 @@ def test_architecture_names_every_part_of_the_package():
     assert {part for part in parts if f"`{part}`" not in page} == {"__init__", "__main__"}
 
 
+def test_walks_through_the_architecture_name_modules():
+    walks = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8").split("## Walks", 1)[1]
+    named = set(re.findall(r"`(\w+/[\w/]+)`", walks))
+    assert len(named) > 40
+    assert {name for name in named if not (ROOT / "lfpiv_cli" / f"{name}.py").exists()} == set()
+
+
 def test_the_glossary_names_parts_of_the_package():
     rows = [
         line.split(" | ") for line in (ROOT / "docs" / "glossary.md").read_text().splitlines() if line.startswith("| ")
