@@ -68,6 +68,8 @@ FIRST_DIAMETERS = (0.06, 0.12, 0.25, 0.5, 0.9, 1.5, 2.4, 3.8)
 # Then sizes that are these shares apart, and so many microlenses at least: with the light of the first candidates taken
 # off, and with all that two rounds find.
 WIDE, NARROW, SMALLEST_STEP = (0.25, 0.1), (0.06, 0.04, 0.03), 0.03
+# A diameter that grows beyond is that of no tracer: of light that crowds, balls as wide as all of it explain most.
+LARGEST = 1.5 * FIRST_DIAMETERS[-1]
 # So many candidates around the middle of all are enough, and all others only take time.
 MOST_CANDIDATES = 400
 # Parabolas are believed up to so many times as far from the middle as sizes were tried.
@@ -93,8 +95,9 @@ SWEEPS = 2
 MODEL_SHARE, MODEL_LENSES = 0.01, 0.025
 # Of a diameter that is below so many of its standard errors only an upper limit is known.
 LIMIT_SIGMAS = 3.0
-# Tracers that are enough, and where there are none, the diameter that is taken.
-ENOUGH, UNKNOWN_LENSES = 10, 0.5
+# Tracers that are enough, of so many images where there are as many; and where there are none, the diameter that is
+# taken.
+ENOUGH, FEWEST_FRAMES, UNKNOWN_LENSES = 10, 2, 0.5
 # Only noise is left around a tracer whose chi-squared per pixel is at most this: 1 to 2.3 with the right size and the
 # neighbours found, 4 to 500 where neighbours are missing.
 NOISE_ALONE = 3.0
@@ -134,6 +137,7 @@ class Diameter:
     tracers : by how many
     shown : by waves, with diffusion, by the images alone
     held : the same with what is given
+    frames : what single images show of it, where several do
     """
 
     lenses: float
@@ -141,6 +145,7 @@ class Diameter:
     tracers: int
     shown: Together | None = None
     held: Together | None = None
+    frames: tuple[Diameter, ...] = ()
 
     @property
     def resolved(self) -> bool:
@@ -158,8 +163,19 @@ def diameter_by(
     frames: list[Sizes] = []
     for task in tasks:
         frames.append(measured_sizes(task))
-        if sum(sizes.square.size for sizes in frames) >= ENOUGH:
+        # The two images of a pair must agree.
+        if len(frames) >= FEWEST_FRAMES and sum(sizes.square.size for sizes in frames) >= ENOUGH:
             break
+    showing = [sizes for sizes in frames if sizes.square.size]
+    found = _pooled(showing, lenses, diffusion_px)
+    if found is None or len(showing) == 1:
+        return found
+    single = (_pooled([sizes], lenses, diffusion_px) for sizes in showing)
+    return replace(found, frames=tuple(each for each in single if each is not None))
+
+
+def _pooled(frames: Sequence[Sizes], lenses: float | None, diffusion_px: float | None) -> Diameter | None:
+    """Return the diameter that the tracers of some frames show together, by waves with diffusion."""
     found, forms = diameter_of(frames), [sizes.forms for sizes in frames]
     if found is None or not sum(len(each.matrix) for each in forms):
         return found
@@ -260,6 +276,8 @@ def _least_misfit(sought: Sought) -> float:
 def _settled_sizes(sought: Sought, diameter: float, rounds: Sequence[Round]) -> Sizes:
     """Return the sizes of tracers that stand alone, with the search made anew until the diameter stays."""
     for _ in range(SEARCHES):
+        if diameter > LARGEST:
+            return NO_SIZES
         searched_with = diameter
         task, found = _found(sought, diameter, rounds)
         for share in NARROW:
@@ -280,7 +298,7 @@ def _settled_sizes(sought: Sought, diameter: float, rounds: Sequence[Round]) -> 
 
 def _enough(alone: NDArray[np.bool_]) -> bool:
     """Return whether noise is all that is left around enough of the tracers (n,)."""
-    return bool(np.count_nonzero(alone) >= min(ENOUGH, 0.5 * alone.size))
+    return bool(np.count_nonzero(alone) >= max(min(ENOUGH, 0.5 * alone.size), 1))
 
 
 def _forms(task: Task, found: State, diameter: float) -> Forms:

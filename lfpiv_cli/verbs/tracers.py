@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 
@@ -68,6 +69,7 @@ class TracerSize:
     measured_mm, sigma_mm : by their images, and its standard error; None where no image shows it
     resolved : whether more than an upper limit is known by the images
     diffusion : by waves, how far charge diffuses in the sensor
+    frames : what single images show of it, where several do
     """
 
     diameter_mm: float
@@ -75,6 +77,7 @@ class TracerSize:
     sigma_mm: float | None = None
     resolved: bool = False
     diffusion: Diffusion | None = None
+    frames: tuple[TracerSize, ...] = ()
 
     @property
     def at_most_mm(self) -> float | None:
@@ -100,8 +103,23 @@ class TracerSize:
 
 
 def size_notices(settings: Config, size: TracerSize) -> list[Notice]:
-    """Return where what is given of diameter and diffusion contradicts the images, or where they do not tell it."""
-    return _diameter_notices(settings, size) + ([] if size.diffusion is None else _diffusion_notices(size.diffusion))
+    """Return where diameter and diffusion as given contradict the images, these each other, or where none tells."""
+    told = [*_diameter_notices(settings, size), *([] if size.diffusion is None else _diffusion_notices(size.diffusion))]
+    diameters = [(each.measured_mm, each.sigma_mm) for each in size.frames]
+    diffusions = [(each.diffusion.measured_px, each.diffusion.sigma_px) for each in size.frames if each.diffusion]
+    for key, unit, values in (("particle_diameter_mm", "mm", diameters), ("diffusion_px", "px", diffusions)):
+        known = [(value, sigma) for value, sigma in values if value is not None and sigma is not None]
+        for (one, sigma), (other, other_sigma) in combinations(known, 2):
+            if abs(one - other) > CONTRADICTING_SIGMAS * np.hypot(sigma, other_sigma):
+                text = (
+                    f"{written(one)} ± {written(sigma, 2)} {unit} by one image and "
+                    f"{written(other)} ± {written(other_sigma, 2)} {unit} by another, which contradict each other"
+                )
+                remedy = "check focus, exposure and the laser's light in either image; or give it, if it is known"
+                told.append(
+                    Notice("images-differ", f"reconstruction.{key}", text, remedy, one, f"{written(other)} {unit}")
+                )
+    return told
 
 
 def _diffusion_notices(found: Diffusion) -> list[Notice]:
