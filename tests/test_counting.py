@@ -87,8 +87,9 @@ def test_tracers_that_cannot_be_told_apart_are_counted(bench: Bench) -> None:
     image = image_of(bench, 12.0, 0) - np.float32(100.0)
     frame = frame_of(bench, image, image)
     points = points_of(bench, frame, find(bench, frame), TracerSize(0.05), {})
-    unexplained, crowded = light_notices(points, "crowded")
-    assert (unexplained.code, crowded.code) == ("light-unexplained", "particles-crowded")
+    # What they light is nearly explained, by particles that are not there.
+    model, crowded = light_notices(points, "crowded")
+    assert (model.code, crowded.code) == ("light-model", "particles-crowded")
     # Two standard errors of what one image of so few microlenses tells.
     assert crowded.measured == pytest.approx(12.0, rel=0.4)
 

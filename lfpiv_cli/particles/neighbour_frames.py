@@ -248,7 +248,8 @@ def second_pass(task: Task, own: Floats, neighbours: Sequence[Floats], search_mm
     state, _ = prune(task, merge(task, state), CLAIMED_SHARE, LAST_UNEXPLAINED)
     fits = judged(task, state, ROUNDS[-1].unexplained)
     state, _ = with_suspects_checked(task, state, fits, ROUNDS[-1])
-    return finished(task, merge(task, state), ROUNDS[-1])
+    # First passes have told two with one peak apart.
+    return finished(task, merge(task, state), ROUNDS[-1], checks=0)
 
 
 def _missing_particles(
@@ -263,19 +264,15 @@ def _missing_particles(
         expected, partnerless = _without_partner(own, other, search_mm, scale)
         known = np.concatenate([own[partnerless, :3], missing[:, :3]])
         seen = (expected[:, 2] >= task.depths_mm[0]) & (expected[:, 2] <= task.depths_mm[1])
-        seen &= ~_same(expected[:, :3] / same, known / same)
+        if len(expected) and len(known):
+            # One is a known one that lies within 1 and is each other's nearest.
+            points, others = expected[:, :3] / same, known / same
+            distance, to = KDTree(others).query(points)
+            _, back = KDTree(points).query(others)
+            seen &= ~((distance <= 1.0) & (back[to] == np.arange(len(points))))
         missing = np.concatenate([missing, expected[seen]])
         partnered |= ~partnerless
     return missing * (1.0, 1.0, 1.0, FIRST_SHARE), partnered
-
-
-def _same(points: Floats, known: Floats) -> NDArray[np.bool_]:
-    """Return which points (n, 3) are known ones (m, 3): within 1 and each other's nearest."""
-    if not len(points) or not len(known):
-        return np.zeros(len(points), np.bool_)
-    distance, to = KDTree(known).query(points)
-    _, back = KDTree(points).query(known)
-    return np.asarray((distance <= 1.0) & (back[to] == np.arange(len(points))))
 
 
 def _without_partner(own: Floats, other: Floats, search_mm: float, scale: Scale) -> tuple[Floats, NDArray[np.bool_]]:
