@@ -16,10 +16,12 @@ from lfpiv_cli.particles.light_errors import MUCH_LEFT
 
 # More than this share of an image's light, its noise taken off, is too much to leave unexplained.
 LARGEST_UNEXPLAINED = 0.2
-# At so many found for each microlens, fewer than there are, stated errors begin to cover less than four fifths.
-LARGEST_CROWD = 1.3
+# At so many found for each microlens stated errors begin to cover less than .85: of 1.6 tracers as many are found, and
+# .88 to .94 covered; of 2, of which 1.5 to 1.8 are found, .6 to .7.
+LARGEST_CROWD = 1.4
 # Microlenses whose focal length is off by a larger share are told: depths are off by some three stated errors for each
-# per cent. Good ones seem up to 0.002 off, and more the more light is left.
+# per cent. Good ones seem up to 0.002 off, and more the more light is left, and the more tracers there are for each
+# microlens from one on.
 LARGEST_FOCUS_ERROR = 0.005
 # Beyond so many standard errors what is seen is not by chance.
 CERTAIN_SIGMAS = 5.0
@@ -207,7 +209,7 @@ def light_notices(points: Points, name: str) -> list[Notice]:
                 f"at most {LARGEST_CROWD:g}",
             )
         )
-    off, largest = measured.get("microlens_focus", 0.0), LARGEST_FOCUS_ERROR * max(unexplained / MUCH_LEFT, 1.0)
+    off, largest = measured.get("microlens_focus", 0.0), LARGEST_FOCUS_ERROR * max(unexplained / MUCH_LEFT, crowd, 1.0)
     if abs(off) > max(largest, CERTAIN_SIGMAS * measured.get("microlens_focus_sigma", 0.0)):
         least = "at least " if measured.get("light") == "waves" else ""
         notices.append(
