@@ -221,6 +221,11 @@ class Region(NamedTuple):
     middle_mm: NDArray[np.float64]
     radius_mm: float
 
+    @property
+    def inner(self) -> Region:
+        """The half as wide one about the same point."""
+        return Region(self.middle_mm, 0.5 * self.radius_mm)
+
     def holds(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Return which points (n, 2 or more) lie in it."""
         return np.asarray(np.linalg.norm(points[:, :2] - self.middle_mm, axis=1) <= self.radius_mm)
@@ -293,7 +298,12 @@ def _settled_sizes(sought: Sought, diameter: float, rounds: Sequence[Round]) -> 
     unseen = best < diameter and (pooled := diameter_of([sizes])) is not None and not pooled.resolved
     if best != diameter and not unseen:
         return NO_SIZES
-    return sizes._replace(forms=_forms(task, found, diameter)) if by_waves(task.view) else sizes
+    if not by_waves(task.view):
+        return sizes
+    # In the inner half of the region, which the image holds.
+    near = np.count_nonzero(sought.region.inner.holds(found.particles))
+    lenses = np.pi * (sought.region.inner.radius_mm / task.view.scale.lens_mm) ** 2
+    return sizes._replace(forms=_forms(task, found, diameter)._replace(crowd=near / lenses))
 
 
 def _enough(alone: NDArray[np.bool_]) -> bool:
