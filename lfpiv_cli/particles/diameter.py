@@ -200,9 +200,18 @@ def diameter_of(frames: Sequence[Sizes]) -> Diameter | None:
 def measured_sizes(task: Task) -> Sizes:
     """Return what the tracers of an image show of their sizes; `task` may be of any size."""
     candidates, light = candidates_of(task, blank(task), ROUNDS[0].iterations, None)
-    region = _middle_region(candidates)
+    region = Region(np.zeros(2), 0.0)
+    if len(candidates):
+        middle = np.median(candidates[:, :2], axis=0)
+        distances = np.sort(np.linalg.norm(candidates[:, :2] - middle, axis=1))
+        region = Region(middle, float(distances[min(MOST_CANDIDATES, len(distances)) - 1]))
     candidates = candidates[region.holds(candidates)]
-    state = _with_light(task, blank(task), candidates)
+    # Typical is the light that most of the candidates' comes from.
+    state = blank(task)
+    *_, seen = judge(observed(task, state, LAST_UNEXPLAINED), candidates)
+    bright = candidates[seen > WELL_SEEN, 3]
+    typical = of_half_the_sum(bright) if bright.size else 0.0
+    state = replace(state, typical_light=typical, noise=noise_with(task, typical))
     diameter, apart = _first_diameter(task, state, _apart(task, state, candidates))
     if not len(apart):
         return NO_SIZES
@@ -336,23 +345,6 @@ def _begun(task: Task, state: State) -> State:
     return rebuilt(task, state, state.particles[:0])
 
 
-def _with_light(task: Task, state: State, candidates: NDArray[np.float64]) -> State:
-    """Return the state with the light that most of the candidates' comes from as typical."""
-    *_, seen = judge(observed(task, state, LAST_UNEXPLAINED), candidates)
-    light = candidates[seen > WELL_SEEN, 3]
-    typical = of_half_the_sum(light) if light.size else 0.0
-    return replace(state, typical_light=typical, noise=noise_with(task, typical))
-
-
-def _middle_region(candidates: NDArray[np.float64]) -> Region:
-    """Return the region around the middle of all candidates that holds enough of them."""
-    if not len(candidates):
-        return Region(np.zeros(2), 0.0)
-    middle = np.median(candidates[:, :2], axis=0)
-    distances = np.sort(np.linalg.norm(candidates[:, :2] - middle, axis=1))
-    return Region(middle, float(distances[min(MOST_CANDIDATES, len(distances)) - 1]))
-
-
 def _steps(diameter: float, share: float) -> NDArray[np.float64]:
     """Return diameters (m,) around one, a share of it apart."""
     step = max(share * diameter, SMALLEST_STEP)
@@ -391,21 +383,18 @@ def _apart(task: Task, state: State, candidates: NDArray[np.float64]) -> NDArray
     """Return bright candidates (n, 4), those first whose light is most of what is around them."""
     *_, seen = judge(observed(task, state, 0.0), candidates)
     bright = candidates[(candidates[:, 3] > BRIGHT * state.typical_light) & (seen > WELL_SEEN)]
-    share = bright[:, 3] / np.maximum(_light_around(task, bright), bright[:, 3])
-    return bright[np.argsort(-share, kind="stable")[:MOST_TRACERS]]
-
-
-def _light_around(task: Task, points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the light (n,) in squares of the image that hold the light of points and what is around it."""
+    # The light in squares of the image that hold theirs and what is around it.
     view, camera = task.view, task.view.camera
     size = np.array([camera.columns, camera.rows])
     image = np.where(task.usable, task.image, 0.0).reshape(camera.rows, camera.columns)
     sums = np.pad(image.cumsum(axis=0).cumsum(axis=1), ((1, 0), (1, 0)))
-    reach = footprint_radius_mm(view, points) + 2.0 * AROUND_LENSES * max(view.half_x_mm, view.half_y_mm)
-    middle, reach = on_array_mm(view, points) / camera.pixel_mm + 0.5 * size, reach[:, np.newaxis] / camera.pixel_mm
+    reach = footprint_radius_mm(view, bright) + 2.0 * AROUND_LENSES * max(view.half_x_mm, view.half_y_mm)
+    middle, reach = on_array_mm(view, bright) / camera.pixel_mm + 0.5 * size, reach[:, np.newaxis] / camera.pixel_mm
     left, top = np.clip(np.rint(middle - reach), 0, size).astype(np.int64).T
     right, bottom = np.clip(np.rint(middle + reach), 0, size).astype(np.int64).T
-    return np.asarray(sums[bottom, right] - sums[top, right] - sums[bottom, left] + sums[top, left])
+    around = sums[bottom, right] - sums[top, right] - sums[bottom, left] + sums[top, left]
+    share = bright[:, 3] / np.maximum(around, bright[:, 3])
+    return bright[np.argsort(-share, kind="stable")[:MOST_TRACERS]]
 
 
 def _first_diameter(task: Task, state: State, apart: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:

@@ -117,24 +117,17 @@ def find_peaks(volume: NDArray[np.float32], boxes: Boxes) -> tuple[Floats, Float
     # Running sums leave traces of bright planes in dark ones behind them: a peak must have light of its own.
     peak &= ndimage.maximum_filter(volume, boxes.sum, mode="constant") > 0.0
     at = np.argwhere(peak)
-    light, centres = _light_and_centres(volume, at, boxes.light)
-    order = np.lexsort((at[:, 2], at[:, 1], at[:, 0], -light))
-    return centres[order, ::-1], light[order]
-
-
-def _light_and_centres(
-    volume: NDArray[np.float32], at: NDArray[np.int64], box: tuple[int, int, int]
-) -> tuple[Floats, Floats]:
-    """Return the light (n,) and its centre (n, 3) within the box around each index (z, y, x)."""
-    half = [n // 2 for n in box]
+    # Their light and its centre within a box.
+    half = [n // 2 for n in boxes.light]
     padded = np.pad(volume, [(h, h) for h in half])
-    light = np.zeros(len(at))
-    moment = np.zeros((len(at), 3))
-    for offset in np.ndindex(*box):
+    light, moment = np.zeros(len(at)), np.zeros((len(at), 3))
+    for offset in np.ndindex(*boxes.light):
         value = padded[tuple((at + offset).T)].astype(np.float64)
         light += value
         moment += value[:, np.newaxis] * (np.array(offset) - half)
-    return light, at + moment / light[:, np.newaxis]
+    centres = at + moment / light[:, np.newaxis]
+    order = np.lexsort((at[:, 2], at[:, 1], at[:, 0], -light))
+    return centres[order, ::-1], light[order]
 
 
 def points_in_raw_frame(weights: Weights, index_xyz: Floats) -> Floats:

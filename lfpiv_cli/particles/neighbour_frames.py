@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from lfpiv_cli.arrays import Floats
+from lfpiv_cli.particles.fitting import add_all
 from lfpiv_cli.particles.joining import with_twins_joined
 from lfpiv_cli.particles.least_squares import SEARCH_GAIN
 from lfpiv_cli.particles.rounds import (
@@ -44,7 +45,6 @@ from lfpiv_cli.particles.search import (
     prune,
     rebuilt,
     sweep,
-    with_light,
     with_measured_noise,
     with_typical_light,
 )
@@ -136,7 +136,11 @@ def gone_on(task: Task, predicted: Predicted) -> State:
     low, high = at[:, 3] * np.exp(-spread), at[:, 3] * np.exp(spread)
     for unexplained in HELD:
         sweep(task, state, unexplained, 1, SEARCH_GAIN)
-        state = with_light(task, state, np.clip(state.particles[:, 3], low, high))
+        particles, light = state.particles.copy(), np.clip(state.particles[:, 3], low, high)
+        particles[:, 3] = light - state.particles[:, 3]
+        add_all(task.view, particles[particles[:, 3] != 0.0], -1.0, state.residual, task.depths_mm)
+        particles[:, 3] = light
+        state = replace(state, particles=particles)
     sweep(task, state, FREE, 1, SEARCH_GAIN)
     found = state.particles
     sure = (np.abs(found[:, :3] - at[:, :3]) <= PREDICTED_SIGMAS * sigma).all(axis=1)

@@ -304,16 +304,6 @@ def kept(task: Task, state: State, keep: NDArray[np.bool_]) -> State:
     return replace(state, particles=state.particles[keep], expected=state.prior[keep], residual=residual)
 
 
-def with_light(task: Task, state: State, light: Floats) -> State:
-    """Return the state with particles of other light (n,) at the same places, their residual along with them."""
-    particles, residual = state.particles.copy(), state.residual.copy()
-    particles[:, 3] = light - state.particles[:, 3]
-    changed = particles[:, 3] != 0.0
-    add_all(task.view, particles[changed], -1.0, residual, task.depths_mm)
-    particles[:, 3] = light
-    return replace(state, particles=particles, residual=residual)
-
-
 def rebuilt(task: Task, state: State, particles: Floats) -> State:
     """Return the state with other particles, its residual computed from the image."""
     residual = task.image.copy()
