@@ -99,7 +99,11 @@ def together_of(frames: Sequence[Forms], lenses: float | None = None, diffusion_
         ]
     )
     weight, spread = np.ones(len(matrix)), 1.0
-    single = _opening_up(matrix)
+    # What opens downwards is turned up, in units in which the forms' mean is round.
+    unit = np.sqrt(np.abs(np.einsum("nii->ni", matrix)).mean(axis=0))
+    values, vectors = np.linalg.eigh(matrix / np.outer(unit, unit))
+    values = np.maximum(values, LEAST_CURVATURE * np.abs(values).max(axis=1, keepdims=True))
+    single = np.einsum("nik,nk,njk->nij", vectors, values, vectors) * np.outer(unit, unit)
     for _ in range(REWEIGHTINGS):
         whole = np.einsum("n,nij->ij", weight, matrix) + np.diag(sure)
         square = _lowest(whole, weight @ right + sure * expected)
@@ -136,14 +140,6 @@ def _lowest(matrix: NDArray[np.float64], right: NDArray[np.float64]) -> NDArray[
         if square[k] < 0.0:
             square[k], square[1 - k] = 0.0, max(right[1 - k] / matrix[1 - k, 1 - k], 0.0)
     return np.asarray(square)
-
-
-def _opening_up(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return forms (n, 2, 2) with what opens downwards turned up, in units in which their mean is round."""
-    unit = np.sqrt(np.abs(np.einsum("nii->ni", matrix)).mean(axis=0))
-    values, vectors = np.linalg.eigh(matrix / np.outer(unit, unit))
-    values = np.maximum(values, LEAST_CURVATURE * np.abs(values).max(axis=1, keepdims=True))
-    return np.asarray(np.einsum("nik,nk,njk->nij", vectors, values, vectors) * np.outer(unit, unit))
 
 
 def _of_root(root: float, error: float) -> float:

@@ -157,10 +157,29 @@ def with_twins_joined(task: Task, state: State, unexplained: float, chi2: Floats
     ----------
     chi2 : of its particles, see `judge`, to tell how large a good one's is
     """
-    particles = state.particles.copy()
-    pairs, loss, brightest = _twins(task, state)
+    if len(state.particles) < 2:
+        return state
+    # Pairs that may be one tracer, the nearest first.
+    particles, scale = state.particles.copy(), task.view.scale
+    places = particles[:, :3] / scale.box_mm(APART_LENSES, APART_DEPTHS)
+    pairs = KDTree(places).query_pairs(1.0, output_type="ndarray").astype(np.int64)
+    distance = np.linalg.norm(places[pairs[:, 0]] - places[pairs[:, 1]], axis=1)
+    pairs = pairs[np.lexsort((pairs[:, 1], pairs[:, 0], distance))]
+
+    # What one may lose, and its most light.
+    off = (particles[pairs[:, 0], :3] - particles[pairs[:, 1], :3]) / scale.box_mm(SAME_LENSES, SAME_DEPTHS)
+    close = np.linalg.norm(off, axis=1) < 1.0
+    radius = footprint_radius_mm(task.view, particles)[pairs].max(axis=1)
+    near_focus = radius < NEAR_FOCUS_LENSES * 2.0 * task.view.half_x_mm
+    two_expected = np.asarray(state.prior[:, UNKNOWNS:].any(axis=1))[pairs].all(axis=1)
+    loss = np.where(close & near_focus & ~two_expected, np.inf, LARGEST_LOSS)
+    usual = np.percentile(particles[:, 3], BRIGHTEST_PERCENTILE)
+    brightest = np.where(close & ~(near_focus & two_expected), np.inf, usual)
+    possible = particles[pairs, 3].sum(axis=1) < brightest
+    pairs, loss, brightest = pairs[possible], loss[possible], brightest[possible]
     if not len(pairs):
         return state
+
     joined = join(observed(task, state, unexplained), particles, pairs, loss * good_chi2(chi2), brightest)
     stays, expected = np.ones(len(particles), np.bool_), state.prior
     stays[pairs[joined, 1]], expected[pairs[joined, 0]] = False, nothing_expected(1)
@@ -228,25 +247,3 @@ def _join(
                 respond_all(view, particles[member : member + 1], responses)
                 pixels, values = lit_by(responses, 0)
                 add_light(pixels, values, -particles[member, 3], residual)
-
-
-def _twins(task: Task, state: State) -> tuple[NDArray[np.int64], Floats, Floats]:
-    """Return pairs (m, 2) that may be one tracer, the nearest first; what one may lose and its most light (m,)."""
-    particles, scale = state.particles, task.view.scale
-    if len(particles) < 2:
-        return np.zeros((0, 2), np.int64), np.zeros(0), np.zeros(0)
-    places = particles[:, :3] / scale.box_mm(APART_LENSES, APART_DEPTHS)
-    pairs = KDTree(places).query_pairs(1.0, output_type="ndarray").astype(np.int64)
-    distance = np.linalg.norm(places[pairs[:, 0]] - places[pairs[:, 1]], axis=1)
-    pairs = pairs[np.lexsort((pairs[:, 1], pairs[:, 0], distance))]
-
-    off = (particles[pairs[:, 0], :3] - particles[pairs[:, 1], :3]) / scale.box_mm(SAME_LENSES, SAME_DEPTHS)
-    close = np.linalg.norm(off, axis=1) < 1.0
-    radius = footprint_radius_mm(task.view, particles)[pairs].max(axis=1)
-    near_focus = radius < NEAR_FOCUS_LENSES * 2.0 * task.view.half_x_mm
-    expected = np.asarray(state.prior[:, UNKNOWNS:].any(axis=1))[pairs].all(axis=1)
-    largest_loss = np.where(close & near_focus & ~expected, np.inf, LARGEST_LOSS)
-    usual = np.percentile(particles[:, 3], BRIGHTEST_PERCENTILE)
-    brightest = np.where(close & ~(near_focus & expected), np.inf, usual)
-    possible = particles[pairs, 3].sum(axis=1) < brightest
-    return pairs[possible], largest_loss[possible], brightest[possible]

@@ -265,7 +265,17 @@ def _missing_particles(
     scale, missing, partnered = task.view.scale, np.zeros((0, 4)), np.zeros(len(own), np.bool_)
     same = scale.box_mm(SAME_LENSES, SAME_DEPTHS)
     for other in neighbours:
-        expected, partnerless = _without_partner(own, other, search_mm, scale)
+        there, here = (Seen(each[:, :3], light=Light(each[:, 3])) for each in (other, own))
+        tracks = track(there, here, search_mm, scale)
+        alone, partnerless = np.ones(len(other), np.bool_), np.ones(len(own), np.bool_)
+        alone[tracks.first] = partnerless[tracks.second] = False
+        # Where the other frame's that were not tracked are expected here.
+        expected = np.zeros((0, 4))
+        if len(tracks.first):
+            links = known_of(there, here, tracks.first, tracks.second, scale)
+            expected = other.copy()
+            expected[:, :3] += expected_of(there.position_mm, links, search_mm, scale).displacement_mm
+            expected = expected[alone]
         known = np.concatenate([own[partnerless, :3], missing[:, :3]])
         seen = (expected[:, 2] >= task.depths_mm[0]) & (expected[:, 2] <= task.depths_mm[1])
         if len(expected) and len(known):
@@ -277,19 +287,3 @@ def _missing_particles(
         missing = np.concatenate([missing, expected[seen]])
         partnered |= ~partnerless
     return missing * (1.0, 1.0, 1.0, FIRST_SHARE), partnered
-
-
-def _without_partner(own: Floats, other: Floats, search_mm: float, scale: Scale) -> tuple[Floats, NDArray[np.bool_]]:
-    """Return another frame's particles (m, 4) that were not tracked, where they are expected here, and which own ones
-    were not.
-    """
-    there, here = (Seen(each[:, :3], light=Light(each[:, 3])) for each in (other, own))
-    tracks = track(there, here, search_mm, scale)
-    alone, partnerless = np.ones(len(other), np.bool_), np.ones(len(own), np.bool_)
-    alone[tracks.first] = partnerless[tracks.second] = False
-    if not len(tracks.first):
-        return np.zeros((0, 4)), partnerless
-    known = known_of(there, here, tracks.first, tracks.second, scale)
-    expected = other.copy()
-    expected[:, :3] += expected_of(there.position_mm, known, search_mm, scale).displacement_mm
-    return expected[alone], partnerless

@@ -21,10 +21,11 @@ from lfpiv_cli.particles.fitting import add_all, judge, nothing_expected, refine
 from lfpiv_cli.particles.least_squares import SMALLEST_GAIN, Observation, observation_of
 from lfpiv_cli.particles.light_errors import changes_of_light, grown, light_left
 from lfpiv_cli.particles.noise import (
+    LEAST_SHARE_OF_LIT,
     LIT_SIGMAS,
+    PHOTONS_PER_PARTICLE,
     Noise,
     error_correlation,
-    estimate_noise,
     measured_noise,
     pixel_weights,
     read_noise,
@@ -245,7 +246,9 @@ def blank(task: Task) -> State:
 
 def noise_with(task: Task, typical_light: float) -> Noise:
     """Return the noise to seek particles with."""
-    noise = estimate_noise(task.read_counts, typical_light, lens_pixels(task.view))
+    # A particle's light is spread over about as many pixels as a micro-image has.
+    least = LEAST_SHARE_OF_LIT * typical_light / lens_pixels(task.view)
+    noise = Noise(max(task.read_counts, least), typical_light / PHOTONS_PER_PARTICLE)
     return noise if task.photons_per_count is None else replace(noise, gain_counts=1.0 / task.photons_per_count)
 
 
