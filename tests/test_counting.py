@@ -14,7 +14,7 @@ from lfpiv_cli.files.config import carried_config
 from lfpiv_cli.files.weights_file import WeightsFile
 from lfpiv_cli.particles.fitting import add_all
 from lfpiv_cli.particles.view import raw_view
-from lfpiv_cli.verbs.frames import Bench, bench_of
+from lfpiv_cli.verbs.frames import Bench, bench_of, frame_notices
 from lfpiv_cli.verbs.particles import find, frame_of, points_of, task_for, tracers_per_lens
 from lfpiv_cli.verbs.tracers import TracerSize, light_notices
 
@@ -87,7 +87,16 @@ def test_tracers_that_cannot_be_told_apart_are_counted(bench: Bench) -> None:
     image = image_of(bench, 12.0, 0) - np.float32(100.0)
     frame = frame_of(bench, image, image)
     points = points_of(bench, frame, find(bench, frame), TracerSize(0.05), {})
-    unexplained, crowded = light_notices(points, "crowded")
-    assert (unexplained.code, crowded.code) == ("light-unexplained", "particles-crowded")
+    # What they light is nearly explained, by particles that are not there.
+    model, crowded = light_notices(points, "crowded")
+    assert (model.code, crowded.code) == ("light-model", "particles-crowded")
     # Two standard errors of what one image of so few microlenses tells.
     assert crowded.measured == pytest.approx(12.0, rel=0.4)
+
+
+def test_crowded_tracers_are_not_taken_for_noise(bench: Bench) -> None:
+    # No pixel is as dark as without light, and most lie far from the median.
+    crowd = image_of(bench, 12.0, 0)
+    noise = np.random.default_rng(0).normal(0.0, 6.0, crowd.shape).astype(np.float32)
+    for image, told in ((crowd, False), (noise, True), (noise + np.float32(100.0), True)):
+        assert ("frame-dark" in {each.code for each in frame_notices(bench, image, image, "a")}) == told

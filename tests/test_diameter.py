@@ -13,12 +13,12 @@ from lfpiv_cli.files.config import load_config
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.camera import Camera, Lattice
 from lfpiv_cli.optics.media import Media
-from lfpiv_cli.particles.diameter import NO_SIZES, Diameter, Sizes, diameter_by, diameter_of
+from lfpiv_cli.particles.diameter import NO_SIZES, Diameter, Sizes, Trial, _settled_sizes, diameter_by, diameter_of
 from lfpiv_cli.particles.fitting import add_all
 from lfpiv_cli.particles.search import Task, task_of
 from lfpiv_cli.particles.view import Light, entry_capacity, raw_view, with_radius
 from lfpiv_cli.reconstruction.equations import normalisers
-from lfpiv_cli.verbs.tracers import TracerSize, size_notices
+from lfpiv_cli.verbs.tracers import Diffusion, TracerSize, size_notices
 from lfpiv_cli.weights.build import default_padding, factorise
 from lfpiv_cli.weights.model import Weights
 from tests.particle_twin import entries_of
@@ -169,6 +169,49 @@ def test_a_view_of_other_balls_is_that_made_for_them(table2: Camera, water: Medi
 def test_notices_of_the_diameter(given: float | None, size: TracerSize, codes: list[str]) -> None:
     settings = load_config(ROOT / "configs" / "table2.yaml").overridden("reconstruction", particle_diameter_mm=given)
     assert [notice.code for notice in size_notices(settings, size)] == codes
+
+
+def test_a_size_that_grows_beyond_all_tracers_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    searched = []
+
+    def grown(task: None, found: None, diameters: NDArray[np.float64], unexplained: float) -> Trial:
+        return Trial(1.2 * float(diameters.max()), np.zeros((5, 12)), np.ones(12, np.bool_))
+
+    monkeypatch.setattr("lfpiv_cli.particles.diameter._found", lambda _, size, __: (None, searched.append(size)))
+    monkeypatch.setattr("lfpiv_cli.particles.diameter._tried", grown)
+    assert _settled_sizes(None, 3.8, ()) is NO_SIZES  # type: ignore[arg-type]
+    assert searched == [3.8]
+    # Where a size is found with which no tracer holds, none stands alone.
+    monkeypatch.setattr(
+        "lfpiv_cli.particles.diameter._tried", lambda *_: Trial(0.5, np.zeros((5, 0)), np.zeros(0, np.bool_))
+    )
+    assert _settled_sizes(None, 0.5, ()) is NO_SIZES  # type: ignore[arg-type]
+
+
+def test_images_that_contradict_each_other_are_told() -> None:
+    settings = load_config(ROOT / "configs" / "table2.yaml")
+    frames = [TracerSize(0.05, mm, 0.002, True, Diffusion(0.3, px, 0.02)) for mm, px in ((0.05, 0.3), (0.058, 0.5))]
+    for alike in (frames[:1], [frames[0]] * 2):
+        size = TracerSize(0.05, 0.05, 0.002, True, frames=tuple(alike))
+        assert size_notices(settings, size) == []
+    (told,) = size_notices(settings, TracerSize(0.05, 0.05, 0.002, True, frames=tuple(frames)))
+    assert (told.code, told.about) == ("images-differ", "reconstruction.diffusion_px")
+    assert "0.3 ± 0.02 px by one image and 0.5 ± 0.02 px by another" in told.text
+    apart = (frames[0], replace(frames[1], measured_mm=0.07))
+    both = size_notices(settings, TracerSize(0.05, 0.05, 0.002, True, frames=apart))
+    assert [each.about for each in both] == ["reconstruction.particle_diameter_mm", "reconstruction.diffusion_px"]
+
+
+def test_the_two_images_of_a_pair_are_looked_at(monkeypatch: pytest.MonkeyPatch) -> None:
+    squares = iter([0.25, 0.36, 0.49])
+    enough = np.full(10, 0.01)
+    monkeypatch.setattr(
+        "lfpiv_cli.particles.diameter.measured_sizes", lambda _: Sizes(next(squares) + 0 * enough, enough)
+    )
+    found = diameter_by([None, None, None])  # type: ignore[list-item]
+    assert found is not None
+    assert [each.lenses for each in found.frames] == pytest.approx([0.5, 0.6])
+    assert found.tracers == 20
 
 
 def test_files_state_an_error_where_the_diameter_is_by_the_images() -> None:

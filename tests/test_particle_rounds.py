@@ -23,8 +23,10 @@ from lfpiv_cli.particles.view import raw_view
 from lfpiv_cli.reconstruction.equations import normalisers
 from lfpiv_cli.scale import Scale
 from lfpiv_cli.synthetic.render import Balls, render_points
+from lfpiv_cli.validation.volume import particle_figures
 from lfpiv_cli.weights.build import default_padding, factorise, factorise_bricks
 from lfpiv_cli.weights.model import Weights
+from tests.particle_images import task_with
 
 
 def weights_of(camera: Camera, media: Media, grid: Grid) -> Weights:
@@ -252,3 +254,21 @@ def test_peaks_have_light() -> None:
     assert np.all(light > 0.0)
     assert np.isfinite(centres).all()
     assert len(light) == 1
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("seed", [0, 1])
+def test_crowded_tracers_are_told_apart_and_their_errors_are_covered(table2: Camera, water: Media, seed: int) -> None:
+    # 1.5 for each microlens within 1.9 mm: many have one peak, and the image's own noise alone tells them apart.
+    rng = np.random.default_rng(seed)
+    low, high = np.array([-1.0, -0.8, 0.95]), np.array([1.0, 0.8, 2.85])
+    true = rng.uniform((-1.3, -1.1, 0.95, 3e5), (1.3, 1.1, 2.85, 7e5), (858, 4))
+    task = task_with(table2, water, true, rng)
+    found = find_particles(task)
+    sigma = np.sqrt(np.diagonal(found.covariance_mm2, axis1=1, axis2=2))
+    places = task.camera.to_image_axes(true[:, :3])
+    figures = particle_figures(found.position_mm, places, low, high, 0.1, sigma)
+    # Without the last checks 0.78 and 0.80 were found, and 0.55 to 0.68 of their errors covered.
+    assert figures["recall"] > 0.9
+    assert figures["precision"] > 0.85
+    assert min(figures[f"coverage_{axis}"] for axis in "xyz") > 0.8

@@ -152,9 +152,8 @@ class CellShares(NamedTuple):
     radius_mm: float
 
 
-def no_shares() -> CellShares:
-    """Return the empty table of rectangular cells."""
-    return CellShares(np.zeros((0, 0, 0, COLUMNS)), np.zeros(0), 1.0, 1.0)
+# The empty table of rectangular cells.
+NO_SHARES = CellShares(np.zeros((0, 0, 0, COLUMNS)), np.zeros(0), 1.0, 1.0)
 
 
 def hexagon_radius(lattice: Lattice) -> float:

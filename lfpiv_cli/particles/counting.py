@@ -99,53 +99,40 @@ def tracers_in_image(
     """Return what `tracers_per_lens` does of a picture (rows, columns), of which pixels are usable."""
     lenses = Lenses.of(lattice_px, (picture.shape[0], picture.shape[1]))
     counts, usable = picture.ravel(), usable_pixels.ravel()
-    counted = lenses.sums(usable) > LEAST_PIXELS * np.median(lenses.sums(np.ones(counts.size)))
-    counted &= lenses.sums(_sees_volume(seeded, picture.shape)) > LEAST_PIXELS * lenses.sums(np.ones(counts.size))
+    # Pixels before the volume, as the focal plane is seen.
+    camera, lateral, volume = seeded.camera, seeded.around, seeded.volume
+    corners = camera.to_image_axes(np.array([volume.bounds_mm(axis) for axis in range(2)]).T)
+    ends = camera.mm_to_px(camera.magnification * corners)
+    (left, top), (right, bottom) = ends.min(axis=0), ends.max(axis=0)
+    row, column = np.indices(picture.shape)
+    before = ((column >= left) & (column <= right) & (row >= top) & (row <= bottom)).ravel()
+    whole = lenses.sums(np.ones(counts.size))
+    counted = lenses.sums(usable) > LEAST_PIXELS * np.median(whole)
+    counted &= lenses.sums(before) > LEAST_PIXELS * whole
     seen = int(np.count_nonzero(counted))
     if seen < FEWEST_LENSES:
         return None
     background = np.percentile(counts[usable], BACKGROUND_PERCENTILE)
     found = _unevenness(lenses.sums(np.where(usable, counts - background, 0.0)), counted)
+
+    # As real ones, the known tracers are around the volume, too, as far as their light reaches it.
+    low, high = np.array([lateral.bounds_mm(0), lateral.bounds_mm(1), volume.bounds_mm(2)]).T
+    area_mm2 = camera.lattice.cell_area / camera.magnification**2
+    number = round(KNOWN_NUMBER * float(np.prod((high - low)[:2])) / area_mm2)
     rng, known = np.random.default_rng(0), []
     for _ in range(-(-LENSES_OF_KNOWN // seen)):
         image = np.zeros(counts.size)
-        add_all(seeded.view, known_tracers(seeded, rng), 1.0, image, seeded.depths_mm)
+        places = camera.to_image_axes(rng.uniform(low, high, (number, 3)))
+        tracers = np.column_stack([places, rng.normal(1.0, LIGHT_SPREAD, number).clip(0.0)])
+        add_all(seeded.view, tracers, 1.0, image, seeded.depths_mm)
         known.append(_unevenness(lenses.sums(np.where(usable, image, 0.0)), counted))
     return KNOWN_NUMBER * float(np.mean(known)) / found if found > 0.0 else None
 
 
-def known_tracers(seeded: Seeded, rng: np.random.Generator) -> NDArray[np.float64]:
-    """Return tracers (n, 4) of light about 1 at random places: `KNOWN_NUMBER` in the depth of the volume.
-
-    As real ones, they are around it, too, as far as their light reaches it.
-    """
-    camera = seeded.camera
-    lateral, depth = seeded.around, seeded.volume
-    low, high = np.array([lateral.bounds_mm(0), lateral.bounds_mm(1), depth.bounds_mm(2)]).T
-    area_mm2 = camera.lattice.cell_area / camera.magnification**2
-    count = round(KNOWN_NUMBER * float(np.prod((high - low)[:2])) / area_mm2)
-    places = camera.to_image_axes(rng.uniform(low, high, (count, 3)))
-    return np.column_stack([places, rng.normal(1.0, LIGHT_SPREAD, count).clip(0.0)])
-
-
-def _sees_volume(seeded: Seeded, shape: tuple[int, ...]) -> NDArray[np.bool_]:
-    """Return which pixels (pixels,) lie before the volume, as the focal plane is seen."""
-    camera, grid = seeded.camera, seeded.volume
-    corners = camera.to_image_axes(np.array([grid.bounds_mm(axis) for axis in range(2)]).T)
-    ends = camera.mm_to_px(camera.magnification * corners)
-    (left, top), (right, bottom) = ends.min(axis=0), ends.max(axis=0)
-    row, column = np.indices(shape)
-    return np.asarray((column >= left) & (column <= right) & (row >= top) & (row <= bottom)).ravel()
-
-
 def _unevenness(light: NDArray[np.float64], counted: NDArray[np.bool_]) -> float:
     """Return variance / mean^2 of the light of microlenses, each compared with those near it; 0 without light."""
-    near = _means_near(light, counted)[counted]
-    return float(np.mean((light[counted] - near) ** 2) / np.mean(near**2)) if np.any(near > 0.0) else 0.0
-
-
-def _means_near(light: NDArray[np.float64], counted: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Return the mean light of those microlenses that are counted in the field around each, 0 where there are none."""
     share = ndimage.uniform_filter(counted.astype(np.float64), FIELD_LENSES, mode="constant")
     total = ndimage.uniform_filter(np.where(counted, light, 0.0), FIELD_LENSES, mode="constant")
-    return np.divide(total, share, out=np.zeros_like(total), where=share > 0.5 / FIELD_LENSES**2)
+    some = share > 0.5 / FIELD_LENSES**2
+    near = np.divide(total, share, out=np.zeros_like(total), where=some)[counted]
+    return float(np.mean((light[counted] - near) ** 2) / np.mean(near**2)) if np.any(near > 0.0) else 0.0

@@ -36,7 +36,7 @@ from lfpiv_cli.particles.least_squares import (
     substitute,
 )
 from lfpiv_cli.particles.noise import Correlation
-from lfpiv_cli.particles.view import View, footprint_radius_mm, on_array_mm
+from lfpiv_cli.particles.view import footprint_radius_mm, on_array_mm
 from lfpiv_cli.threads import COUNT_NO_REFERENCES, blocks, in_threads
 
 # Neighbours that are left free: with twice as many the errors of 8,300 particles change by a thousandth.
@@ -117,8 +117,22 @@ def joint_covariance(
 
 def _equations(observation: Observation, particles: Floats) -> Equations:
     """Return the normal matrix of all particles."""
-    slopes = _slopes(observation, particles)
-    neighbours = _overlapping(observation.optics, particles)
+    parts = in_threads(lambda part: _slopes_of(observation, particles[part]), blocks(len(particles), BLOCK))
+    counts, pixel, slope = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
+    row, column = np.divmod(pixel, observation.optics.camera.columns, dtype=np.int32)
+    slopes = Slopes(np.concatenate([[0], np.cumsum(counts)]), row, column, slope)
+
+    # Particles whose footprints may overlap: light that touches a lens's cell spreads over it.
+    view = observation.optics
+    on_array = on_array_mm(view, particles)
+    reach = footprint_radius_mm(view, particles) + 2.0 * max(view.half_x_mm, view.half_y_mm)
+    first, second = KDTree(on_array).query_pairs(2.0 * float(reach.max(initial=0.0)), p=np.inf, output_type="ndarray").T
+    near = np.abs(on_array[first] - on_array[second]).max(axis=1) < reach[first] + reach[second]
+    pairs = np.concatenate([np.stack([first, second]), np.stack([second, first])], axis=1)[:, np.tile(near, 2)]
+    pairs = pairs[:, np.lexsort(pairs[::-1])]
+    start = np.searchsorted(pairs[0], np.arange(len(particles) + 1))
+    neighbours = Neighbours(start.astype(np.int64), pairs[1].astype(np.int64))
+
     alone = np.zeros((len(particles), UNKNOWNS, UNKNOWNS))
     block = np.zeros((neighbours.other.size, UNKNOWNS, UNKNOWNS))
     in_threads(
@@ -126,14 +140,6 @@ def _equations(observation: Observation, particles: Floats) -> Equations:
         blocks(len(particles), BLOCK),
     )
     return Equations(slopes, neighbours, alone, block, np.asarray(np.linalg.inv(alone), np.float64))
-
-
-def _slopes(observation: Observation, particles: Floats) -> Slopes:
-    """Return what each particle's unknowns do to the pixels."""
-    parts = in_threads(lambda part: _slopes_of(observation, particles[part]), blocks(len(particles), BLOCK))
-    counts, pixel, slope = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
-    row, column = np.divmod(pixel, observation.optics.camera.columns, dtype=np.int32)
-    return Slopes(np.concatenate([[0], np.cumsum(counts)]), row, column, slope)
 
 
 @njit(cache=True, nogil=True)
@@ -175,19 +181,6 @@ def _pulls(slopes: Slopes, changes: Floats, columns: int) -> Floats:
     return pulls
 
 
-def _overlapping(view: View, particles: Floats) -> Neighbours:
-    """Return the particles whose footprints may overlap."""
-    on_array = on_array_mm(view, particles)
-    # Light that touches a lens's cell spreads over it.
-    reach = footprint_radius_mm(view, particles) + 2.0 * max(view.half_x_mm, view.half_y_mm)
-    first, second = KDTree(on_array).query_pairs(2.0 * float(reach.max(initial=0.0)), p=np.inf, output_type="ndarray").T
-    near = np.abs(on_array[first] - on_array[second]).max(axis=1) < reach[first] + reach[second]
-    pairs = np.concatenate([np.stack([first, second]), np.stack([second, first])], axis=1)[:, np.tile(near, 2)]
-    pairs = pairs[:, np.lexsort(pairs[::-1])]
-    start = np.searchsorted(pairs[0], np.arange(len(particles) + 1))
-    return Neighbours(start.astype(np.int64), pairs[1].astype(np.int64))
-
-
 @njit(cache=True, **COUNT_NO_REFERENCES)
 def _rectangle(slopes: Slopes, n: int) -> tuple[int, int, int, int]:
     """Return first row, first column, rows and columns of the rectangle of pixels that a particle lights."""
@@ -200,12 +193,6 @@ def _rectangle(slopes: Slopes, n: int) -> tuple[int, int, int, int]:
         top, bottom = min(top, slopes.row[k]), max(bottom, slopes.row[k])
         left, right = min(left, slopes.column[k]), max(right, slopes.column[k])
     return top, left, bottom - top + 1, right - left + 1
-
-
-@njit(cache=True)
-def _at_least(room: Floats, size: int) -> Floats:
-    """Return an array of at least this size, the one that is there if it will do: large ones take long to make."""
-    return room if room.size >= size else np.empty(size)
 
 
 @njit(cache=True, nogil=True)
@@ -322,29 +309,25 @@ def _covariances(
                 result[k, a, b] = (1.0 + excess) * inverse[a, b]
         if correlation.share + excess > 0.0:
             top, left, rows, columns = _rectangle(equations.slopes, n)
-            room = _at_least(room, rows * columns * UNKNOWNS)
+            # Large arrays take long to make.
+            if room.size < rows * columns * UNKNOWNS:
+                room = np.empty(rows * columns * UNKNOWNS)
             moved_by = room[: rows * columns * UNKNOWNS].reshape(rows, columns, UNKNOWNS)
             moved_by[:] = 0.0
             for m in range(members.size):
                 of_m = inverse[:, UNKNOWNS * m : UNKNOWNS * (m + 1)]
                 _add_moves(equations.slopes, members[m], of_m, top, left, moved_by)
             _add_excess(moved_by, correlation.decay, correlation.share + excess, result[k])
-        _add_shared(inverse, members, pulls, result[k])
-
-
-@njit(cache=True)
-def _add_shared(inverse: Floats, members: NDArray[np.int64], pulls: Floats, result: Floats) -> None:
-    """Add what errors that all particles share move the first of some members by, with the inverse's rows (4, n)."""
-    moved = np.empty(UNKNOWNS)
-    for k in range(pulls.shape[2]):
-        moved[:] = 0.0
-        for m in range(members.size):
+        # What errors that all particles share move it by.
+        for shared in range(pulls.shape[2]):
+            moved = np.zeros(UNKNOWNS)
+            for m in range(members.size):
+                for a in range(UNKNOWNS):
+                    for b in range(UNKNOWNS):
+                        moved[a] += inverse[a, UNKNOWNS * m + b] * pulls[members[m], b, shared]
             for a in range(UNKNOWNS):
                 for b in range(UNKNOWNS):
-                    moved[a] += inverse[a, UNKNOWNS * m + b] * pulls[members[m], b, k]
-        for a in range(UNKNOWNS):
-            for b in range(UNKNOWNS):
-                result[a, b] += moved[a] * moved[b]
+                    result[k, a, b] += moved[a] * moved[b]
 
 
 @njit(cache=True)

@@ -68,6 +68,8 @@ FIRST_DIAMETERS = (0.06, 0.12, 0.25, 0.5, 0.9, 1.5, 2.4, 3.8)
 # Then sizes that are these shares apart, and so many microlenses at least: with the light of the first candidates taken
 # off, and with all that two rounds find.
 WIDE, NARROW, SMALLEST_STEP = (0.25, 0.1), (0.06, 0.04, 0.03), 0.03
+# A diameter that grows beyond is that of no tracer: of light that crowds, balls as wide as all of it explain most.
+LARGEST = 1.5 * FIRST_DIAMETERS[-1]
 # So many candidates around the middle of all are enough, and all others only take time.
 MOST_CANDIDATES = 400
 # Parabolas are believed up to so many times as far from the middle as sizes were tried.
@@ -93,8 +95,9 @@ SWEEPS = 2
 MODEL_SHARE, MODEL_LENSES = 0.01, 0.025
 # Of a diameter that is below so many of its standard errors only an upper limit is known.
 LIMIT_SIGMAS = 3.0
-# Tracers that are enough, and where there are none, the diameter that is taken.
-ENOUGH, UNKNOWN_LENSES = 10, 0.5
+# Tracers that are enough, of so many images where there are as many; and where there are none, the diameter that is
+# taken.
+ENOUGH, FEWEST_FRAMES, UNKNOWN_LENSES = 10, 2, 0.5
 # Only noise is left around a tracer whose chi-squared per pixel is at most this: 1 to 2.3 with the right size and the
 # neighbours found, 4 to 500 where neighbours are missing.
 NOISE_ALONE = 3.0
@@ -134,6 +137,7 @@ class Diameter:
     tracers : by how many
     shown : by waves, with diffusion, by the images alone
     held : the same with what is given
+    frames : what single images show of it, where several do
     """
 
     lenses: float
@@ -141,6 +145,7 @@ class Diameter:
     tracers: int
     shown: Together | None = None
     held: Together | None = None
+    frames: tuple[Diameter, ...] = ()
 
     @property
     def resolved(self) -> bool:
@@ -158,8 +163,19 @@ def diameter_by(
     frames: list[Sizes] = []
     for task in tasks:
         frames.append(measured_sizes(task))
-        if sum(sizes.square.size for sizes in frames) >= ENOUGH:
+        # The two images of a pair must agree.
+        if len(frames) >= FEWEST_FRAMES and sum(sizes.square.size for sizes in frames) >= ENOUGH:
             break
+    showing = [sizes for sizes in frames if sizes.square.size]
+    found = _pooled(showing, lenses, diffusion_px)
+    if found is None or len(showing) == 1:
+        return found
+    single = (_pooled([sizes], lenses, diffusion_px) for sizes in showing)
+    return replace(found, frames=tuple(each for each in single if each is not None))
+
+
+def _pooled(frames: Sequence[Sizes], lenses: float | None, diffusion_px: float | None) -> Diameter | None:
+    """Return the diameter that the tracers of some frames show together, by waves with diffusion."""
     found, forms = diameter_of(frames), [sizes.forms for sizes in frames]
     if found is None or not sum(len(each.matrix) for each in forms):
         return found
@@ -184,9 +200,18 @@ def diameter_of(frames: Sequence[Sizes]) -> Diameter | None:
 def measured_sizes(task: Task) -> Sizes:
     """Return what the tracers of an image show of their sizes; `task` may be of any size."""
     candidates, light = candidates_of(task, blank(task), ROUNDS[0].iterations, None)
-    region = _middle_region(candidates)
+    region = Region(np.zeros(2), 0.0)
+    if len(candidates):
+        middle = np.median(candidates[:, :2], axis=0)
+        distances = np.sort(np.linalg.norm(candidates[:, :2] - middle, axis=1))
+        region = Region(middle, float(distances[min(MOST_CANDIDATES, len(distances)) - 1]))
     candidates = candidates[region.holds(candidates)]
-    state = _with_light(task, blank(task), candidates)
+    # Typical is the light that most of the candidates' comes from.
+    state = blank(task)
+    *_, seen = judge(observed(task, state, LAST_UNEXPLAINED), candidates)
+    bright = candidates[seen > WELL_SEEN, 3]
+    typical = of_half_the_sum(bright) if bright.size else 0.0
+    state = replace(state, typical_light=typical, noise=noise_with(task, typical))
     diameter, apart = _first_diameter(task, state, _apart(task, state, candidates))
     if not len(apart):
         return NO_SIZES
@@ -204,6 +229,11 @@ class Region(NamedTuple):
 
     middle_mm: NDArray[np.float64]
     radius_mm: float
+
+    @property
+    def inner(self) -> Region:
+        """The half as wide one about the same point."""
+        return Region(self.middle_mm, 0.5 * self.radius_mm)
 
     def holds(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Return which points (n, 2 or more) lie in it."""
@@ -260,6 +290,8 @@ def _least_misfit(sought: Sought) -> float:
 def _settled_sizes(sought: Sought, diameter: float, rounds: Sequence[Round]) -> Sizes:
     """Return the sizes of tracers that stand alone, with the search made anew until the diameter stays."""
     for _ in range(SEARCHES):
+        if diameter > LARGEST:
+            return NO_SIZES
         searched_with = diameter
         task, found = _found(sought, diameter, rounds)
         for share in NARROW:
@@ -275,12 +307,17 @@ def _settled_sizes(sought: Sought, diameter: float, rounds: Sequence[Round]) -> 
     unseen = best < diameter and (pooled := diameter_of([sizes])) is not None and not pooled.resolved
     if best != diameter and not unseen:
         return NO_SIZES
-    return sizes._replace(forms=_forms(task, found, diameter)) if by_waves(task.view) else sizes
+    if not by_waves(task.view):
+        return sizes
+    # In the inner half of the region, which the image holds.
+    near = np.count_nonzero(sought.region.inner.holds(found.particles))
+    lenses = np.pi * (sought.region.inner.radius_mm / task.view.scale.lens_mm) ** 2
+    return sizes._replace(forms=_forms(task, found, diameter)._replace(crowd=near / lenses))
 
 
 def _enough(alone: NDArray[np.bool_]) -> bool:
     """Return whether noise is all that is left around enough of the tracers (n,)."""
-    return bool(np.count_nonzero(alone) >= min(ENOUGH, 0.5 * alone.size))
+    return bool(np.count_nonzero(alone) >= max(min(ENOUGH, 0.5 * alone.size), 1))
 
 
 def _forms(task: Task, found: State, diameter: float) -> Forms:
@@ -306,23 +343,6 @@ def _forms(task: Task, found: State, diameter: float) -> Forms:
 def _begun(task: Task, state: State) -> State:
     """Return the state without particles, with a residual of its own, which is worked on in place."""
     return rebuilt(task, state, state.particles[:0])
-
-
-def _with_light(task: Task, state: State, candidates: NDArray[np.float64]) -> State:
-    """Return the state with the light that most of the candidates' comes from as typical."""
-    *_, seen = judge(observed(task, state, LAST_UNEXPLAINED), candidates)
-    light = candidates[seen > WELL_SEEN, 3]
-    typical = of_half_the_sum(light) if light.size else 0.0
-    return replace(state, typical_light=typical, noise=noise_with(task, typical))
-
-
-def _middle_region(candidates: NDArray[np.float64]) -> Region:
-    """Return the region around the middle of all candidates that holds enough of them."""
-    if not len(candidates):
-        return Region(np.zeros(2), 0.0)
-    middle = np.median(candidates[:, :2], axis=0)
-    distances = np.sort(np.linalg.norm(candidates[:, :2] - middle, axis=1))
-    return Region(middle, float(distances[min(MOST_CANDIDATES, len(distances)) - 1]))
 
 
 def _steps(diameter: float, share: float) -> NDArray[np.float64]:
@@ -363,21 +383,18 @@ def _apart(task: Task, state: State, candidates: NDArray[np.float64]) -> NDArray
     """Return bright candidates (n, 4), those first whose light is most of what is around them."""
     *_, seen = judge(observed(task, state, 0.0), candidates)
     bright = candidates[(candidates[:, 3] > BRIGHT * state.typical_light) & (seen > WELL_SEEN)]
-    share = bright[:, 3] / np.maximum(_light_around(task, bright), bright[:, 3])
-    return bright[np.argsort(-share, kind="stable")[:MOST_TRACERS]]
-
-
-def _light_around(task: Task, points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the light (n,) in squares of the image that hold the light of points and what is around it."""
+    # The light in squares of the image that hold theirs and what is around it.
     view, camera = task.view, task.view.camera
     size = np.array([camera.columns, camera.rows])
     image = np.where(task.usable, task.image, 0.0).reshape(camera.rows, camera.columns)
     sums = np.pad(image.cumsum(axis=0).cumsum(axis=1), ((1, 0), (1, 0)))
-    reach = footprint_radius_mm(view, points) + 2.0 * AROUND_LENSES * max(view.half_x_mm, view.half_y_mm)
-    middle, reach = on_array_mm(view, points) / camera.pixel_mm + 0.5 * size, reach[:, np.newaxis] / camera.pixel_mm
+    reach = footprint_radius_mm(view, bright) + 2.0 * AROUND_LENSES * max(view.half_x_mm, view.half_y_mm)
+    middle, reach = on_array_mm(view, bright) / camera.pixel_mm + 0.5 * size, reach[:, np.newaxis] / camera.pixel_mm
     left, top = np.clip(np.rint(middle - reach), 0, size).astype(np.int64).T
     right, bottom = np.clip(np.rint(middle + reach), 0, size).astype(np.int64).T
-    return np.asarray(sums[bottom, right] - sums[top, right] - sums[bottom, left] + sums[top, left])
+    around = sums[bottom, right] - sums[top, right] - sums[bottom, left] + sums[top, left]
+    share = bright[:, 3] / np.maximum(around, bright[:, 3])
+    return bright[np.argsort(-share, kind="stable")[:MOST_TRACERS]]
 
 
 def _first_diameter(task: Task, state: State, apart: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:

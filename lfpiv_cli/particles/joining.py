@@ -117,24 +117,17 @@ def find_peaks(volume: NDArray[np.float32], boxes: Boxes) -> tuple[Floats, Float
     # Running sums leave traces of bright planes in dark ones behind them: a peak must have light of its own.
     peak &= ndimage.maximum_filter(volume, boxes.sum, mode="constant") > 0.0
     at = np.argwhere(peak)
-    light, centres = _light_and_centres(volume, at, boxes.light)
-    order = np.lexsort((at[:, 2], at[:, 1], at[:, 0], -light))
-    return centres[order, ::-1], light[order]
-
-
-def _light_and_centres(
-    volume: NDArray[np.float32], at: NDArray[np.int64], box: tuple[int, int, int]
-) -> tuple[Floats, Floats]:
-    """Return the light (n,) and its centre (n, 3) within the box around each index (z, y, x)."""
-    half = [n // 2 for n in box]
+    # Their light and its centre within a box.
+    half = [n // 2 for n in boxes.light]
     padded = np.pad(volume, [(h, h) for h in half])
-    light = np.zeros(len(at))
-    moment = np.zeros((len(at), 3))
-    for offset in np.ndindex(*box):
+    light, moment = np.zeros(len(at)), np.zeros((len(at), 3))
+    for offset in np.ndindex(*boxes.light):
         value = padded[tuple((at + offset).T)].astype(np.float64)
         light += value
         moment += value[:, np.newaxis] * (np.array(offset) - half)
-    return light, at + moment / light[:, np.newaxis]
+    centres = at + moment / light[:, np.newaxis]
+    order = np.lexsort((at[:, 2], at[:, 1], at[:, 0], -light))
+    return centres[order, ::-1], light[order]
 
 
 def points_in_raw_frame(weights: Weights, index_xyz: Floats) -> Floats:
@@ -164,10 +157,29 @@ def with_twins_joined(task: Task, state: State, unexplained: float, chi2: Floats
     ----------
     chi2 : of its particles, see `judge`, to tell how large a good one's is
     """
-    particles = state.particles.copy()
-    pairs, loss, brightest = _twins(task, state)
+    if len(state.particles) < 2:
+        return state
+    # Pairs that may be one tracer, the nearest first.
+    particles, scale = state.particles.copy(), task.view.scale
+    places = particles[:, :3] / scale.box_mm(APART_LENSES, APART_DEPTHS)
+    pairs = KDTree(places).query_pairs(1.0, output_type="ndarray").astype(np.int64)
+    distance = np.linalg.norm(places[pairs[:, 0]] - places[pairs[:, 1]], axis=1)
+    pairs = pairs[np.lexsort((pairs[:, 1], pairs[:, 0], distance))]
+
+    # What one may lose, and its most light.
+    off = (particles[pairs[:, 0], :3] - particles[pairs[:, 1], :3]) / scale.box_mm(SAME_LENSES, SAME_DEPTHS)
+    close = np.linalg.norm(off, axis=1) < 1.0
+    radius = footprint_radius_mm(task.view, particles)[pairs].max(axis=1)
+    near_focus = radius < NEAR_FOCUS_LENSES * 2.0 * task.view.half_x_mm
+    two_expected = np.asarray(state.prior[:, UNKNOWNS:].any(axis=1))[pairs].all(axis=1)
+    loss = np.where(close & near_focus & ~two_expected, np.inf, LARGEST_LOSS)
+    usual = np.percentile(particles[:, 3], BRIGHTEST_PERCENTILE)
+    brightest = np.where(close & ~(near_focus & two_expected), np.inf, usual)
+    possible = particles[pairs, 3].sum(axis=1) < brightest
+    pairs, loss, brightest = pairs[possible], loss[possible], brightest[possible]
     if not len(pairs):
         return state
+
     joined = join(observed(task, state, unexplained), particles, pairs, loss * good_chi2(chi2), brightest)
     stays, expected = np.ones(len(particles), np.bool_), state.prior
     stays[pairs[joined, 1]], expected[pairs[joined, 0]] = False, nothing_expected(1)
@@ -235,25 +247,3 @@ def _join(
                 respond_all(view, particles[member : member + 1], responses)
                 pixels, values = lit_by(responses, 0)
                 add_light(pixels, values, -particles[member, 3], residual)
-
-
-def _twins(task: Task, state: State) -> tuple[NDArray[np.int64], Floats, Floats]:
-    """Return pairs (m, 2) that may be one tracer, the nearest first; what one may lose and its most light (m,)."""
-    particles, scale = state.particles, task.view.scale
-    if len(particles) < 2:
-        return np.zeros((0, 2), np.int64), np.zeros(0), np.zeros(0)
-    places = particles[:, :3] / scale.box_mm(APART_LENSES, APART_DEPTHS)
-    pairs = KDTree(places).query_pairs(1.0, output_type="ndarray").astype(np.int64)
-    distance = np.linalg.norm(places[pairs[:, 0]] - places[pairs[:, 1]], axis=1)
-    pairs = pairs[np.lexsort((pairs[:, 1], pairs[:, 0], distance))]
-
-    off = (particles[pairs[:, 0], :3] - particles[pairs[:, 1], :3]) / scale.box_mm(SAME_LENSES, SAME_DEPTHS)
-    close = np.linalg.norm(off, axis=1) < 1.0
-    radius = footprint_radius_mm(task.view, particles)[pairs].max(axis=1)
-    near_focus = radius < NEAR_FOCUS_LENSES * 2.0 * task.view.half_x_mm
-    expected = np.asarray(state.prior[:, UNKNOWNS:].any(axis=1))[pairs].all(axis=1)
-    largest_loss = np.where(close & near_focus & ~expected, np.inf, LARGEST_LOSS)
-    usual = np.percentile(particles[:, 3], BRIGHTEST_PERCENTILE)
-    brightest = np.where(close & ~(near_focus & expected), np.inf, usual)
-    possible = particles[pairs, 3].sum(axis=1) < brightest
-    return pairs[possible], largest_loss[possible], brightest[possible]

@@ -15,7 +15,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lfpiv_cli.arrays import Floats
 from lfpiv_cli.particles.diameter import Sizes, middle_of
@@ -47,7 +46,9 @@ def focal_length_of(view: View, particles: Floats, residual: Floats, weight: Flo
     """
     if len(particles) < FEWEST_PARTICLES:
         return None
-    views = (view, _with_longer(view))
+    camera, length = view.camera, (1.0 + STEP) * view.camera.microlens_focal_length_mm
+    bend = 1.0 - camera.microlens_distance_mm / length
+    views = (view, view._replace(camera=camera._replace(microlens_focal_length_mm=length, bend=bend)))
     depth = particles[:, 2]
     room = max(entry_capacity(each, depth.min(), depth.max()) for each in views)
     nearest = np.argsort(np.hypot(particles[:, 0], particles[:, 1]), kind="stable")[:MOST_PARTICLES]
@@ -59,13 +60,6 @@ def focal_length_of(view: View, particles: Floats, residual: Floats, weight: Flo
     return FocalLength(middle, error)
 
 
-def _with_longer(view: View) -> View:
-    """Return the view of microlenses whose focal length is longer by a step."""
-    camera, length = view.camera, (1.0 + STEP) * view.camera.microlens_focal_length_mm
-    bend = 1.0 - camera.microlens_distance_mm / length
-    return view._replace(camera=camera._replace(microlens_focal_length_mm=length, bend=bend))
-
-
 def _step(
     views: tuple[View, View], particle: Floats, residual: Floats, weight: Floats, room: int
 ) -> tuple[float, float] | None:
@@ -73,10 +67,19 @@ def _step(
 
     In differences of the other one; None where it tells nothing.
     """
-    lit = [_light(view, particle, room) for view in views]
+    lit = []
+    for view in views:
+        responses = room_for(1, room, 0)
+        respond_all(view, particle[np.newaxis], responses)
+        own_pixels, values = lit_by(responses, 0)
+        lit.append((own_pixels, values[:UNKNOWNS, : own_pixels.size]))
     pixels = np.unique(np.concatenate([each for each, _ in lit]))
     root = np.sqrt(weight[pixels])
-    own, longer = (_on(pixels, *each) * root for each in lit)
+    # Light and its derivatives by x, y and z (4, pixels), summed where a pixel is named twice.
+    own, longer = (
+        np.stack([np.bincount(np.searchsorted(pixels, at), row, pixels.size) for row in values]) * root
+        for at, values in lit
+    )
     kept = np.linalg.qr(own.T)[0]
     design, rest = particle[3] * (longer[0] - own[0]), residual[pixels] * root
     design, rest = (each - kept @ (kept.T @ each) for each in (design, rest))
@@ -85,17 +88,3 @@ def _step(
         return None
     scatter = max(float(np.sum(rest**2)) / freedom, 1.0)
     return float(np.sum(design * rest)) / told, float(np.sqrt(scatter / told))
-
-
-def _light(view: View, particle: Floats, room: int) -> tuple[NDArray[np.int32], Floats]:
-    """Return the pixels (n,) that a particle lights, its light of unit and the derivatives by x, y and z (4, n)."""
-    responses = room_for(1, room, 0)
-    respond_all(view, particle[np.newaxis], responses)
-    pixels, values = lit_by(responses, 0)
-    return pixels, values[:UNKNOWNS, : pixels.size]
-
-
-def _on(pixels: NDArray[np.int32], lit: NDArray[np.int32], values: Floats) -> Floats:
-    """Return values (k, n) of lit pixels as of others (m,) that hold them, (k, m), summed where one is named twice."""
-    place = np.searchsorted(pixels, lit)
-    return np.stack([np.bincount(place, row, pixels.size) for row in values])

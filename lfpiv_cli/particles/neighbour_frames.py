@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from lfpiv_cli.arrays import Floats
+from lfpiv_cli.particles.fitting import add_all
 from lfpiv_cli.particles.joining import with_twins_joined
 from lfpiv_cli.particles.least_squares import SEARCH_GAIN
 from lfpiv_cli.particles.rounds import (
@@ -44,7 +45,6 @@ from lfpiv_cli.particles.search import (
     prune,
     rebuilt,
     sweep,
-    with_light,
     with_measured_noise,
     with_typical_light,
 )
@@ -136,7 +136,11 @@ def gone_on(task: Task, predicted: Predicted) -> State:
     low, high = at[:, 3] * np.exp(-spread), at[:, 3] * np.exp(spread)
     for unexplained in HELD:
         sweep(task, state, unexplained, 1, SEARCH_GAIN)
-        state = with_light(task, state, np.clip(state.particles[:, 3], low, high))
+        particles, light = state.particles.copy(), np.clip(state.particles[:, 3], low, high)
+        particles[:, 3] = light - state.particles[:, 3]
+        add_all(task.view, particles[particles[:, 3] != 0.0], -1.0, state.residual, task.depths_mm)
+        particles[:, 3] = light
+        state = replace(state, particles=particles)
     sweep(task, state, FREE, 1, SEARCH_GAIN)
     found = state.particles
     sure = (np.abs(found[:, :3] - at[:, :3]) <= PREDICTED_SIGMAS * sigma).all(axis=1)
@@ -248,7 +252,8 @@ def second_pass(task: Task, own: Floats, neighbours: Sequence[Floats], search_mm
     state, _ = prune(task, merge(task, state), CLAIMED_SHARE, LAST_UNEXPLAINED)
     fits = judged(task, state, ROUNDS[-1].unexplained)
     state, _ = with_suspects_checked(task, state, fits, ROUNDS[-1])
-    return finished(task, merge(task, state), ROUNDS[-1])
+    # First passes have told two with one peak apart.
+    return finished(task, merge(task, state), ROUNDS[-1], checks=0)
 
 
 def _missing_particles(
@@ -260,35 +265,25 @@ def _missing_particles(
     scale, missing, partnered = task.view.scale, np.zeros((0, 4)), np.zeros(len(own), np.bool_)
     same = scale.box_mm(SAME_LENSES, SAME_DEPTHS)
     for other in neighbours:
-        expected, partnerless = _without_partner(own, other, search_mm, scale)
+        there, here = (Seen(each[:, :3], light=Light(each[:, 3])) for each in (other, own))
+        tracks = track(there, here, search_mm, scale)
+        alone, partnerless = np.ones(len(other), np.bool_), np.ones(len(own), np.bool_)
+        alone[tracks.first] = partnerless[tracks.second] = False
+        # Where the other frame's that were not tracked are expected here.
+        expected = np.zeros((0, 4))
+        if len(tracks.first):
+            links = known_of(there, here, tracks.first, tracks.second, scale)
+            expected = other.copy()
+            expected[:, :3] += expected_of(there.position_mm, links, search_mm, scale).displacement_mm
+            expected = expected[alone]
         known = np.concatenate([own[partnerless, :3], missing[:, :3]])
         seen = (expected[:, 2] >= task.depths_mm[0]) & (expected[:, 2] <= task.depths_mm[1])
-        seen &= ~_same(expected[:, :3] / same, known / same)
+        if len(expected) and len(known):
+            # One is a known one that lies within 1 and is each other's nearest.
+            points, others = expected[:, :3] / same, known / same
+            distance, to = KDTree(others).query(points)
+            _, back = KDTree(points).query(others)
+            seen &= ~((distance <= 1.0) & (back[to] == np.arange(len(points))))
         missing = np.concatenate([missing, expected[seen]])
         partnered |= ~partnerless
     return missing * (1.0, 1.0, 1.0, FIRST_SHARE), partnered
-
-
-def _same(points: Floats, known: Floats) -> NDArray[np.bool_]:
-    """Return which points (n, 3) are known ones (m, 3): within 1 and each other's nearest."""
-    if not len(points) or not len(known):
-        return np.zeros(len(points), np.bool_)
-    distance, to = KDTree(known).query(points)
-    _, back = KDTree(points).query(known)
-    return np.asarray((distance <= 1.0) & (back[to] == np.arange(len(points))))
-
-
-def _without_partner(own: Floats, other: Floats, search_mm: float, scale: Scale) -> tuple[Floats, NDArray[np.bool_]]:
-    """Return another frame's particles (m, 4) that were not tracked, where they are expected here, and which own ones
-    were not.
-    """
-    there, here = (Seen(each[:, :3], light=Light(each[:, 3])) for each in (other, own))
-    tracks = track(there, here, search_mm, scale)
-    alone, partnerless = np.ones(len(other), np.bool_), np.ones(len(own), np.bool_)
-    alone[tracks.first] = partnerless[tracks.second] = False
-    if not len(tracks.first):
-        return np.zeros((0, 4)), partnerless
-    known = known_of(there, here, tracks.first, tracks.second, scale)
-    expected = other.copy()
-    expected[:, :3] += expected_of(there.position_mm, known, search_mm, scale).displacement_mm
-    return expected[alone], partnerless

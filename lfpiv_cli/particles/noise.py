@@ -136,7 +136,15 @@ def measured_noise(model: Floats, residual: Floats, usable: NDArray[np.bool_], n
     if number < FEWEST_CLASSES:
         return noise
     light, left = model[lit], residual[lit]
-    classes = _classes(light, number)
+
+    # As many pixels in each class as may be. Where light fills a micro-image its pixels are alike but for rounding: it
+    # must not tell where they belong, and classes that are left with few pixels by that say nothing.
+    ends = np.cumsum([len(part) for part in np.array_split(light, number)])[:-1]
+    edges = np.partition(light, ends)[ends] * (1.0 - ALIKE)
+    member = np.searchsorted(edges, light, side="right").astype(np.int16)
+    # Small integers are sorted in one pass.
+    parts = np.split(np.argsort(member, kind="stable"), np.cumsum(np.bincount(member, minlength=number))[:-1])
+    classes = [part for part in parts if 2 * part.size >= SMALLEST_CLASS]
     if len(classes) < FEWEST_CLASSES:
         return noise
     brightness = np.array([np.mean(light[members]) for members in classes])
@@ -147,33 +155,6 @@ def measured_noise(model: Floats, residual: Floats, usable: NDArray[np.bool_], n
     # A variance is as sure as it is large.
     (gain, error2), _ = nnls(terms / variance[:, np.newaxis], 1.0 - noise.read_counts**2 / variance)
     return Noise(noise.read_counts, float(gain), float(np.sqrt(error2)))
-
-
-def _classes(light: Floats, number: int) -> list[NDArray[np.int64]]:
-    """Return the pixels of each class of brightness, as many in each as may be.
-
-    Where light fills a micro-image its pixels are alike but for rounding, which must not tell where they belong.
-    Classes that are left with few pixels by that say nothing.
-    """
-    ends = np.cumsum([len(part) for part in np.array_split(light, number)])[:-1]
-    edges = np.partition(light, ends)[ends] * (1.0 - ALIKE)
-    member = np.searchsorted(edges, light, side="right").astype(np.int16)
-    # Small integers are sorted in one pass.
-    parts = np.split(np.argsort(member, kind="stable"), np.cumsum(np.bincount(member, minlength=number))[:-1])
-    return [part for part in parts if 2 * part.size >= SMALLEST_CLASS]
-
-
-def estimate_noise(read_counts: float, typical_light: float, lens_pixels: float) -> Noise:
-    """Return the noise of an image to seek particles with.
-
-    Parameters
-    ----------
-    read_counts : see `read_noise`
-    typical_light : of a particle, counts; 0 where it is not known
-    lens_pixels : pixels of a micro-image, over about as many of which a particle's light is spread
-    """
-    least = LEAST_SHARE_OF_LIT * typical_light / lens_pixels
-    return Noise(max(read_counts, least), typical_light / PHOTONS_PER_PARTICLE)
 
 
 def read_noise(image: Floats) -> float:

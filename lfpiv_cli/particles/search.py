@@ -21,10 +21,11 @@ from lfpiv_cli.particles.fitting import add_all, judge, nothing_expected, refine
 from lfpiv_cli.particles.least_squares import SMALLEST_GAIN, Observation, observation_of
 from lfpiv_cli.particles.light_errors import changes_of_light, grown, light_left
 from lfpiv_cli.particles.noise import (
+    LEAST_SHARE_OF_LIT,
     LIT_SIGMAS,
+    PHOTONS_PER_PARTICLE,
     Noise,
     error_correlation,
-    estimate_noise,
     measured_noise,
     pixel_weights,
     read_noise,
@@ -83,6 +84,10 @@ LAST_SWEEPS, LAST_UNEXPLAINED = 4, 0.02
 SMALLEST_LIGHT = 0.3
 # A particle stays while at least this much of it meets the sensor.
 SMALLEST_SEEN = 0.1
+# A good particle's chi-squared is the one at this percentile, at most 1: crowds make noise seem larger than it is. What
+# others exceed it by is light of neighbours that were not found, or wrongly; a particle takes up some of that itself,
+# and it counts as so many times as much. Single frames of 0.4 to 1.2 tracers per microlens are covered by that.
+GOOD_PERCENTILE, TAKEN_UP = 20.0, 2.0
 # Lengths are in the camera's own units (`scale`): microlenses laterally, depths over which light spreads by one lens
 # (Table 2: 0.04, 0.25 and 0.3 mm).
 # Two particles this close, laterally and in depth, are in one place.
@@ -241,7 +246,9 @@ def blank(task: Task) -> State:
 
 def noise_with(task: Task, typical_light: float) -> Noise:
     """Return the noise to seek particles with."""
-    noise = estimate_noise(task.read_counts, typical_light, lens_pixels(task.view))
+    # A particle's light is spread over about as many pixels as a micro-image has.
+    least = LEAST_SHARE_OF_LIT * typical_light / lens_pixels(task.view)
+    noise = Noise(max(task.read_counts, least), typical_light / PHOTONS_PER_PARTICLE)
     return noise if task.photons_per_count is None else replace(noise, gain_counts=1.0 / task.photons_per_count)
 
 
@@ -300,16 +307,6 @@ def kept(task: Task, state: State, keep: NDArray[np.bool_]) -> State:
     return replace(state, particles=state.particles[keep], expected=state.prior[keep], residual=residual)
 
 
-def with_light(task: Task, state: State, light: Floats) -> State:
-    """Return the state with particles of other light (n,) at the same places, their residual along with them."""
-    particles, residual = state.particles.copy(), state.residual.copy()
-    particles[:, 3] = light - state.particles[:, 3]
-    changed = particles[:, 3] != 0.0
-    add_all(task.view, particles[changed], -1.0, residual, task.depths_mm)
-    particles[:, 3] = light
-    return replace(state, particles=particles, residual=residual)
-
-
 def rebuilt(task: Task, state: State, particles: Floats) -> State:
     """Return the state with other particles, its residual computed from the image."""
     residual = task.image.copy()
@@ -352,7 +349,9 @@ def result(task: Task, state: State) -> Particles:
     changes = None
     if task.light_covariance is not None:
         changes = changes_of_light(task.view, particles, task.light_covariance, task.depths_mm)
-    covariance = joint_covariance(observation, particles, correlation, chi2, changes)
+    good = min(float(np.percentile(chi2, GOOD_PERCENTILE)), 1.0) if chi2.size else 1.0
+    missing = 1.0 + TAKEN_UP * np.maximum(chi2 / good - 1.0, 0.0)
+    covariance = joint_covariance(observation, particles, correlation, missing, changes)
     # Where there is a model: elsewhere is the light of particles that were not found.
     lit = task.usable & (task.image - state.residual > LIT_SIGMAS * state.noise.read_counts)
     share = light_left(task.image[lit], state.residual[lit], state.noise.read_counts)

@@ -27,7 +27,7 @@ from lfpiv_cli.particles.least_squares import (
     respond_all,
     room_for,
 )
-from lfpiv_cli.particles.search import SMALLEST_LIGHT, State, Task, observed
+from lfpiv_cli.particles.search import GOOD_PERCENTILE, SMALLEST_LIGHT, State, Task, observed
 from lfpiv_cli.particles.view import footprint_px, footprint_radius_mm, over_tiles
 from lfpiv_cli.scale import Scale
 
@@ -182,9 +182,8 @@ def try_other_depths(
     return fit_again(observation, particles, suspects, effort, starts, least, prior).moved
 
 
-# A good particle's chi-squared is the one at this percentile; particles that fit worse by this factor are
-# suspects.
-GOOD_PERCENTILE, SUSPECT_CHI2 = 20.0, 1.5
+# Particles that fit worse than good ones by this factor are suspects.
+SUSPECT_CHI2 = 1.5
 # Light that stays within about one lens fits well at many depths: radii, in lenses, of footprints near the focal plane.
 # Elsewhere hardly one in a hundred suspects finds another depth: it must fit worse by this factor.
 NEAR_FOCUS_LENSES, ELSEWHERE_CHI2 = 0.6, 3.0

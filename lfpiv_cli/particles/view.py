@@ -26,7 +26,7 @@ from lfpiv_cli.optics.line_responses import NO_LINES, LineResponses, line_respon
 from lfpiv_cli.optics.media import Layers, Media
 from lfpiv_cli.optics.surfaces import Faces
 from lfpiv_cli.optics.tracing import ObjectSpace
-from lfpiv_cli.particles.cells import cell_shares, hexagon_radius, no_shares, rim_table, smallest_ball_mm
+from lfpiv_cli.particles.cells import NO_SHARES, cell_shares, hexagon_radius, rim_table, smallest_ball_mm
 from lfpiv_cli.particles.pencil import lines_of
 from lfpiv_cli.scale import Scale
 from lfpiv_cli.threads import in_threads
@@ -157,7 +157,7 @@ def raw_view(
     radius = max(particle_radius_mm, SMALLEST_RADIUS_LENSES * scale.lens_mm)
     if lattice.layout == "square":
         half_x, half_y = 0.5 * lattice.pitch
-        cell_reach, shares = 0.5, no_shares()
+        cell_reach, shares = 0.5, NO_SHARES
     else:
         half_x = half_y = hexagon_radius(lattice)
         cell_reach = 2.0 / 3.0
@@ -192,13 +192,8 @@ def raw_view(
     )
     if light is None:
         return view
-    points = _points(_numbers(camera), plane, light.wavelength_mm, light.depths_mm)
-    return with_diffusion(view._replace(points=points), light.diffusion_px)
-
-
-def _numbers(camera: Camera) -> tuple[float, ...]:
-    """Return what the light of a point depends on of a camera."""
-    return (
+    # What the light of a point depends on of a camera.
+    numbers = (
         camera.magnification,
         camera.focal_length_mm,
         camera.aperture_mm,
@@ -207,6 +202,8 @@ def _numbers(camera: Camera) -> tuple[float, ...]:
         float(camera.lattice.pitch.mean()),
         camera.pixel_mm,
     )
+    points = _points(numbers, plane, light.wavelength_mm, light.depths_mm)
+    return with_diffusion(view._replace(points=points), light.diffusion_px)
 
 
 @lru_cache(maxsize=2)

@@ -238,8 +238,8 @@ def follow_particles(
     found: Trajectories | None
     count, deadline = sum(map(len, needed)), options.deadline()
     searched = sum(number < 2 for number in needed[0])
-    steps = searched * particles.STEPS + (count - searched) * PREDICTED_STEPS
-    with console.frames(count, steps / max(count, 1), "follow") as work:
+    work_steps = searched * particles.STEPS + (count - searched) * PREDICTED_STEPS
+    with console.frames(count, work_steps / max(count, 1), "follow") as work:
         stores = [
             FrameFiles(
                 targets,

@@ -177,21 +177,29 @@ def sized(bench: Bench, frames: Iterable[Frame]) -> tuple[Bench, TracerSize]:
     found = diameter_by(
         (task_for(bench, frame) for frame in islice(frames, LOOKED_AT)), given and given / lens_mm, given_px
     )
-    if found is None:
-        size = TracerSize(given or UNKNOWN_LENSES * lens_mm)
-    else:
-        measured = lens_mm * found.lenses
-        size = TracerSize(given or measured, measured, lens_mm * found.sigma_lenses, found.resolved)
-    if chosen.wavelength_nm is None:
+    size = _size_of(found, given, given_px, lens_mm, by_waves=chosen.wavelength_nm is not None)
+    if found is not None:
+        single = (_size_of(each, given, given_px, lens_mm, size.diffusion is not None) for each in found.frames)
+        size = replace(size, frames=tuple(single))
+    if size.diffusion is None:
         settings, covariance = bench.settings.overridden("reconstruction", particle_diameter_mm=size.diameter_mm), None
     else:
-        diffusion = _diffusion(found, given_px)
-        size = replace(size, diffusion=diffusion)
         settings = bench.settings.overridden(
-            "reconstruction", particle_diameter_mm=size.diameter_mm, diffusion_px=diffusion.px
+            "reconstruction", particle_diameter_mm=size.diameter_mm, diffusion_px=size.diffusion.px
         )
         covariance = None if found is None or found.held is None else found.held.covariance
     return replace(bench, settings=settings, light_covariance=covariance), size
+
+
+def _size_of(
+    found: Diameter | None, given: float | None, given_px: float | None, lens_mm: float, by_waves: bool
+) -> TracerSize:
+    """Return the tracers' size, as given or by what images show of it, by waves with diffusion."""
+    diffusion = _diffusion(found, given_px) if by_waves else None
+    if found is None:
+        return TracerSize(given or UNKNOWN_LENSES * lens_mm, diffusion=diffusion)
+    measured = lens_mm * found.lenses
+    return TracerSize(given or measured, measured, lens_mm * found.sigma_lenses, found.resolved, diffusion)
 
 
 def _diffusion(found: Diameter | None, given_px: float | None) -> Diffusion:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 
@@ -15,10 +16,12 @@ from lfpiv_cli.particles.light_errors import MUCH_LEFT
 
 # More than this share of an image's light, its noise taken off, is too much to leave unexplained.
 LARGEST_UNEXPLAINED = 0.2
-# At so many found for each microlens, fewer than there are, stated errors begin to cover less than four fifths.
-LARGEST_CROWD = 1.3
+# At so many found for each microlens stated errors begin to cover less than .85: of 1.6 tracers as many are found, and
+# .88 to .94 covered; of 2, of which 1.5 to 1.8 are found, .6 to .7.
+LARGEST_CROWD = 1.4
 # Microlenses whose focal length is off by a larger share are told: depths are off by some three stated errors for each
-# per cent. Good ones seem up to 0.002 off, and more the more light is left.
+# per cent. Good ones seem up to 0.002 off, and more the more light is left, and the more tracers there are for each
+# microlens from one on.
 LARGEST_FOCUS_ERROR = 0.005
 # Beyond so many standard errors what is seen is not by chance.
 CERTAIN_SIGMAS = 5.0
@@ -68,6 +71,7 @@ class TracerSize:
     measured_mm, sigma_mm : by their images, and its standard error; None where no image shows it
     resolved : whether more than an upper limit is known by the images
     diffusion : by waves, how far charge diffuses in the sensor
+    frames : what single images show of it, where several do
     """
 
     diameter_mm: float
@@ -75,6 +79,7 @@ class TracerSize:
     sigma_mm: float | None = None
     resolved: bool = False
     diffusion: Diffusion | None = None
+    frames: tuple[TracerSize, ...] = ()
 
     @property
     def at_most_mm(self) -> float | None:
@@ -100,8 +105,23 @@ class TracerSize:
 
 
 def size_notices(settings: Config, size: TracerSize) -> list[Notice]:
-    """Return where what is given of diameter and diffusion contradicts the images, or where they do not tell it."""
-    return _diameter_notices(settings, size) + ([] if size.diffusion is None else _diffusion_notices(size.diffusion))
+    """Return where diameter and diffusion as given contradict the images, these each other, or where none tells."""
+    told = [*_diameter_notices(settings, size), *([] if size.diffusion is None else _diffusion_notices(size.diffusion))]
+    diameters = [(each.measured_mm, each.sigma_mm) for each in size.frames]
+    diffusions = [(each.diffusion.measured_px, each.diffusion.sigma_px) for each in size.frames if each.diffusion]
+    for key, unit, values in (("particle_diameter_mm", "mm", diameters), ("diffusion_px", "px", diffusions)):
+        known = [(value, sigma) for value, sigma in values if value is not None and sigma is not None]
+        for (one, sigma), (other, other_sigma) in combinations(known, 2):
+            if abs(one - other) > CONTRADICTING_SIGMAS * np.hypot(sigma, other_sigma):
+                text = (
+                    f"{written(one)} ± {written(sigma, 2)} {unit} by one image and "
+                    f"{written(other)} ± {written(other_sigma, 2)} {unit} by another, which contradict each other"
+                )
+                remedy = "check focus, exposure and the laser's light in either image; or give it, if it is known"
+                told.append(
+                    Notice("images-differ", f"reconstruction.{key}", text, remedy, one, f"{written(other)} {unit}")
+                )
+    return told
 
 
 def _diffusion_notices(found: Diffusion) -> list[Notice]:
@@ -189,7 +209,7 @@ def light_notices(points: Points, name: str) -> list[Notice]:
                 f"at most {LARGEST_CROWD:g}",
             )
         )
-    off, largest = measured.get("microlens_focus", 0.0), LARGEST_FOCUS_ERROR * max(unexplained / MUCH_LEFT, 1.0)
+    off, largest = measured.get("microlens_focus", 0.0), LARGEST_FOCUS_ERROR * max(unexplained / MUCH_LEFT, crowd, 1.0)
     if abs(off) > max(largest, CERTAIN_SIGMAS * measured.get("microlens_focus_sigma", 0.0)):
         least = "at least " if measured.get("light") == "waves" else ""
         notices.append(
