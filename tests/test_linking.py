@@ -150,6 +150,17 @@ def test_kriging_takes_a_linear_flow_exactly_and_states_what_it_misses(rng: np.r
     np.testing.assert_allclose(value, points[7:8] @ slope, atol=1e-9)
 
 
+def test_kriging_goes_on_where_neighbours_lie_in_one_plane(rng: np.random.Generator) -> None:
+    """As those do that are held at the end of a volume: their places tell no trend across it."""
+    points = np.column_stack([rng.uniform(-2.0, 2.0, (40, 2)), np.full(40, -3.3)])
+    slope, at = np.array([[0.1, 0.0, 0.02], [-0.05, 0.03, 0.0], [0.0, 0.0, 0.0]]), points[:5] + 0.01
+    at[:, 2] = -3.3
+    structure = Structure(np.zeros(3), np.full(3, 1e-3), 1.6)
+    value, variance = kriged(at, np.full(5, -1), points, points @ slope, np.full((40, 3), 1e-6), structure)
+    np.testing.assert_allclose(value, at @ slope, atol=1e-6)
+    assert np.all(variance > 0.0)
+
+
 @pytest.mark.thorough
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_the_structure_of_turbulence_is_found_and_errors_are_stated(seed: int) -> None:

@@ -132,7 +132,12 @@ def kriged(
             matrix[:, :count, count:] = trend
             matrix[:, count:, :count] = trend.swapaxes(1, 2)
             right = np.concatenate([-to, np.ones((len(here), 1)), np.zeros((len(here), terms - 1))], axis=1)
-            weight = np.linalg.solve(matrix, right[..., np.newaxis])[:, :count, 0]
+            try:
+                solved = np.linalg.solve(matrix, right[..., np.newaxis])
+            except np.linalg.LinAlgError:
+                # Neighbours in one plane, as at the end of a volume, tell no trend across it: the least one.
+                solved = np.linalg.pinv(matrix, hermitian=True) @ right[..., np.newaxis]
+            weight = solved[:, :count, 0]
             value[part, axis] = np.sum(weight * displacement[near, axis], axis=1)
             missed = 2.0 * np.sum(weight * to, axis=1) - np.einsum("mi,mij,mj->m", weight, between, weight)
             variance[part, axis] = np.maximum(missed, 0.0) + np.sum(weight**2 * noise, axis=1)
