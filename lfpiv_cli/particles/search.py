@@ -84,9 +84,10 @@ LAST_SWEEPS, LAST_UNEXPLAINED = 4, 0.02
 SMALLEST_LIGHT = 0.3
 # A particle stays while at least this much of it meets the sensor.
 SMALLEST_SEEN = 0.1
-# A good particle's chi-squared is the one at this percentile, at most 1: crowds make noise seem larger than it is. What
-# others exceed it by is light of neighbours that were not found, or wrongly; a particle takes up some of that itself,
-# and it counts as so many times as much. Single frames of 0.4 to 1.2 tracers per microlens are covered by that.
+# A good particle's chi-squared is the one at this percentile, for errors at most 1: crowds make noise seem larger than
+# it is. What others exceed it by is light of neighbours that were not found, or wrongly; a particle takes up some of
+# that itself, and it counts as so many times as much. Single frames of 0.4 to 1.2 tracers per microlens are covered by
+# that.
 GOOD_PERCENTILE, TAKEN_UP = 20.0, 2.0
 # Lengths are in the camera's own units (`scale`): microlenses laterally, depths over which light spreads by one lens
 # (Table 2: 0.04, 0.25 and 0.3 mm).
@@ -336,6 +337,11 @@ def with_measured_noise(task: Task, state: State) -> State:
     return replace(state, noise=measured_noise(task.image - state.residual, state.residual, task.usable, assumed))
 
 
+def usual_chi2(chi2: Floats) -> float:
+    """Return chi-squared of a particle that fits well, as it is; 1 where there is none."""
+    return float(np.percentile(chi2, GOOD_PERCENTILE)) if chi2.size else 1.0
+
+
 def result(task: Task, state: State) -> Particles:
     """Return the particles in world axes, brightest first."""
     shape = task.prepared.shape
@@ -349,8 +355,7 @@ def result(task: Task, state: State) -> Particles:
     changes = None
     if task.light_covariance is not None:
         changes = changes_of_light(task.view, particles, task.light_covariance, task.depths_mm)
-    good = min(float(np.percentile(chi2, GOOD_PERCENTILE)), 1.0) if chi2.size else 1.0
-    missing = 1.0 + TAKEN_UP * np.maximum(chi2 / good - 1.0, 0.0)
+    missing = 1.0 + TAKEN_UP * np.maximum(chi2 / min(usual_chi2(chi2), 1.0) - 1.0, 0.0)
     covariance = joint_covariance(observation, particles, correlation, missing, changes)
     # Where there is a model: elsewhere is the light of particles that were not found.
     lit = task.usable & (task.image - state.residual > LIT_SIGMAS * state.noise.read_counts)

@@ -27,7 +27,7 @@ from lfpiv_cli.particles.least_squares import (
     respond_all,
     room_for,
 )
-from lfpiv_cli.particles.search import GOOD_PERCENTILE, SMALLEST_LIGHT, State, Task, observed
+from lfpiv_cli.particles.search import SMALLEST_LIGHT, State, Task, observed, usual_chi2
 from lfpiv_cli.particles.view import footprint_px, footprint_radius_mm, over_tiles
 from lfpiv_cli.scale import Scale
 
@@ -234,8 +234,8 @@ def with_overlaps_split(task: Task, state: State, chi2: Floats, unexplained: flo
 
 
 def good_chi2(chi2: Floats) -> float:
-    """Return chi-squared of a particle that fits well."""
-    return max(float(np.percentile(chi2, GOOD_PERCENTILE)), 1.0) if chi2.size else 1.0
+    """Return chi-squared of a particle that fits well, at least 1."""
+    return max(usual_chi2(chi2), 1.0)
 
 
 def _signature(scale: Scale, particles: Floats, chi2: Floats) -> Floats:
