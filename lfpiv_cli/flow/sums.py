@@ -46,7 +46,7 @@ SMALLEST_AMPLITUDE = 0.07
 
 
 Row = NDArray[np.float32]
-Weights = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]
+WindowWeights = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]
 
 
 def margins(layout: WindowLayout, shape_zyx: Triple, radius: int) -> tuple[Triple, Triple]:
@@ -127,7 +127,7 @@ def map_sums(
         share_out(sum_products, count[0] * count[1], (a, b), first, blocks.start, blocks.size, found)
         return MapSums(found, energies_a, energies_b, blocks)
     weights = weight_matrices(layout, blocks)
-    here = Region(first, weights)
+    here = WeightedVoxels(first, weights)
 
     def products_of(z: int) -> Iterator[NDArray[np.float32]]:
         still_a, still_b = here.of(a, z), here.of(b, z)
@@ -139,11 +139,11 @@ def map_sums(
     return MapSums(products.reshape(*count, shifts, shifts, shifts), energies_a, energies_b, blocks)
 
 
-class Region(NamedTuple):
+class WeightedVoxels(NamedTuple):
     """The voxels that weighted windows cover: the first one (z, y, x), and the weights, of whose widths it is."""
 
     first: Triple
-    weights: Weights
+    weights: WindowWeights
 
     def of(self, volume: NDArray[Any], z: int, dy: int = 0, dx: int = 0) -> NDArray[Any]:
         """Return a plane of the region in a volume with margins, moved by so many rows and columns."""
@@ -151,7 +151,7 @@ class Region(NamedTuple):
         return volume[z0 + z, y0 + dy : y0 + dy + rows, x0 + dx : x0 + dx + columns]
 
 
-def weight_matrices(layout: WindowLayout, cells: Cells, radius: int = 0) -> Weights:
+def weight_matrices(layout: WindowLayout, cells: Cells, radius: int = 0) -> WindowWeights:
     """Return the weights (sums, voxels) along z, y, x with which voxels count in cells of weighted windows.
 
     Voxels begin `radius` before the first window; each cell has a sum for each shift, from -radius to radius.
@@ -170,7 +170,7 @@ def weight_matrices(layout: WindowLayout, cells: Cells, radius: int = 0) -> Weig
 
 
 def weighted_sums(
-    fields: int, plane: Callable[[int], Iterable[NDArray[np.float32]]], weights: Weights
+    fields: int, plane: Callable[[int], Iterable[NDArray[np.float32]]], weights: WindowWeights
 ) -> NDArray[np.float32]:
     """Return sums (z, fields, y, x) over weighted windows of fields that are made plane by plane, (rows, columns)."""
     along_z, along_y, along_x = weights
@@ -198,7 +198,7 @@ def energies_of(
     nz, ny, nx = count
     if layout.is_weighted:
         weights = weight_matrices(layout, cells_of(layout, 1), radius)
-        whole = Region(triple(begin - radius for begin in first), weights)
+        whole = WeightedVoxels(triple(begin - radius for begin in first), weights)
         sums = weighted_sums(1, lambda z: [whole.of(volume, z) ** 2], weights)
         return sums.reshape(nz, shifts, ny, shifts, nx, shifts).transpose(0, 1, 4, 5, 2, 3).copy()
     planes = (nz - 1) * step[0] + size[0] + 2 * radius
@@ -237,7 +237,7 @@ def pair_moments(
         share_out(sum_cells, count[0] * count[1], (a, b), valid, first, cells.start, cells.size, found)
         return found
     weights = weight_matrices(layout, cells)
-    here, steps = Region(first, weights), ((0, 0, 1), (0, 1, 0), (1, 0, 0))
+    here, steps = WeightedVoxels(first, weights), ((0, 0, 1), (0, 1, 0), (1, 0, 0))
 
     def moments_of(z: int) -> Iterator[NDArray[np.float32]]:
         """The terms of `sum_cells`, in its order."""

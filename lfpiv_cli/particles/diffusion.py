@@ -89,7 +89,8 @@ class Together:
 
 def together_of(frames: Sequence[Forms], lenses: float | None = None, diffusion_px: float | None = None) -> Together:
     """Return what the tracers of some frames show together, with the diameter or diffusion held where it is given."""
-    matrix, right = (np.concatenate(parts) for parts in list(zip(*frames, strict=True))[:2])
+    matrix = np.concatenate([each.matrix for each in frames])
+    right = np.concatenate([each.right for each in frames])
     crowded = max(max(each.crowd for each in frames) / CROWDED, 1.0) ** 2
     expected = np.array([lenses or 0.0, USUAL_DIFFUSION_PX if diffusion_px is None else diffusion_px]) ** 2
     sure = np.array(

@@ -40,12 +40,8 @@ from lfpiv_cli.weights.strip_fits import (
 )
 from lfpiv_cli.weights.strips import StripOperator
 
-# Column cells are sorted by which part of the aperture they see, so that those of a tile see the same: light through
-# one part then comes from some of the tiles only.
-
-
-# Parts of the aperture, side by side: by those along the strips column cells are sorted, and blocks have some
-# neighbouring ones of those across.
+# Parts of the aperture, side by side: by those along the strips column cells are sorted, so that those of a tile see
+# the same and light through one part comes from some of the tiles only; of those across, blocks have neighbouring ones.
 PARTS, FINE_PARTS = 6, 12
 # Rays of each part of a strip.
 RAYS = 8192
