@@ -1,0 +1,56 @@
+"""Commands run in this process, and what they are run on: the shipped sample, or Table 2's camera with a small sensor."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from lfpiv_cli.cli.main import cli
+
+ROOT = Path(__file__).parent.parent
+SAMPLE, CONFIG = ROOT / "sample_data", ROOT / "configs" / "sample.yaml"
+# Of the sample's text: with it no calibration is needed.
+AT_FOCUS = ("reference: mid_plane", "reference: focal_point")
+
+
+def run(*arguments: object) -> None:
+    """Run a command; errors come out as exceptions."""
+    cli.main([str(argument) for argument in arguments], standalone_mode=False)
+
+
+def told(capsys: pytest.CaptureFixture[str], *arguments: object) -> dict[str, Any]:
+    """Run a command; return its summary."""
+    capsys.readouterr()
+    try:
+        run(*arguments, "--json")
+    finally:
+        out = capsys.readouterr().out
+    return dict(json.loads(out))
+
+
+def sample_rig(folder: Path, *changes: tuple[str, str]) -> Path:
+    """Write the sample's config with pieces of its text replaced, each of which must be there."""
+    text = CONFIG.read_text()
+    for old, new in changes:
+        assert old in text, old
+        text = text.replace(old, new)
+    (folder / "rig.yaml").write_text(text)
+    return folder / "rig.yaml"
+
+
+def sample_weights(folder: Path, *changes: tuple[str, str]) -> Path:
+    """Write the weights of such a config about the focal point; return their file."""
+    run("build-weights", sample_rig(folder, AT_FOCUS, *changes), "-o", folder / "weights.h5", "-q")
+    return folder / "weights.h5"
+
+
+def table2_rig(columns: int, rows: int, layout: str = "square", **sections: dict[str, Any]) -> str:
+    """Return the text of a config: Table 2's optics, in water, and other sections."""
+    camera = {
+        "main_lens": {"magnification": -1.0, "focal_length_mm": 100.0, "aperture_mm": 25.0},
+        "microlenses": {"pitch_mm": 0.1, "focal_length_mm": 0.8, "layout": layout},
+        "sensor": {"pixel_um": 5.5, "columns": columns, "rows": rows},
+    }
+    return str(yaml.safe_dump({"camera": camera, "media": {"air": 1.0, "window": 1.49, "fluid": 1.33}} | sections))
