@@ -21,9 +21,8 @@ from lfpiv_cli.optics.camera import Camera, Lattice
 from lfpiv_cli.optics.media import Media
 from lfpiv_cli.optics.tracing import ObjectSpace
 from lfpiv_cli.synthetic.board import BoardPlacement, dot_centres, render_board
-from lfpiv_cli.synthetic.render import render_white
+from lfpiv_cli.synthetic.render import Readout, render_white
 from lfpiv_cli.synthetic.scenes import Misalignment
-from lfpiv_cli.synthetic.sensor import Readout
 
 BENCHES = 60
 FULL_SIZE_EVERY = 10

@@ -14,8 +14,7 @@ from lfpiv_cli.optics.camera import Camera, Lattice
 from lfpiv_cli.optics.media import Media
 from lfpiv_cli.optics.tracing import ObjectSpace
 from lfpiv_cli.reconstruction.solvers import SolverSettings, reconstruct
-from lfpiv_cli.synthetic.render import Balls, render_points
-from lfpiv_cli.synthetic.sensor import Readout
+from lfpiv_cli.synthetic.render import Balls, Readout, render_points
 from lfpiv_cli.weights.build import default_padding, factorise
 
 CAMERA = Camera(-1.0, 100.0, 25.0, 0.8, 0.8, Lattice.regular(0.1), 0.0055, 1200, 1200)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from benchmarks.field_tracks import Tracks, tracks_of, true_displacement_mm
 from lfpiv_cli.fields.fit import fit_field
-from lfpiv_cli.fields.samples import Samples
+from lfpiv_cli.fields.structure import Samples
 from lfpiv_cli.synthetic.flows import Flow, abc, random_modes, source, taylor_green, vortex_ring
 from lfpiv_cli.tracks.gridding import on_grid
 

@@ -28,9 +28,8 @@ from lfpiv_cli.particles.view import raw_view
 from lfpiv_cli.reconstruction.equations import Normalisers, normalisers
 from lfpiv_cli.robust import MAD_TO_SIGMA
 from lfpiv_cli.synthetic.board import BoardPlacement, render_board
-from lfpiv_cli.synthetic.render import Balls, render_points, render_white
+from lfpiv_cli.synthetic.render import Balls, Readout, render_points, render_white
 from lfpiv_cli.synthetic.scenes import Misalignment
-from lfpiv_cli.synthetic.sensor import Readout
 from lfpiv_cli.validation.planning import cramer_rao_bound, expected_image, pixel_variance, slopes
 from lfpiv_cli.validation.volume import match, particle_figures
 from lfpiv_cli.weights.build import default_padding, factorise

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from lfpiv_cli.optics.camera import Camera, Lattice
 from lfpiv_cli.optics.media import Media
 from lfpiv_cli.particles.view import Light, View, raw_view
-from lfpiv_cli.synthetic.sensor import Readout
+from lfpiv_cli.synthetic.render import Readout
 from lfpiv_cli.validation.planning import (
     ROUNDING_VARIANCE,
     UNKNOWNS,

@@ -27,8 +27,7 @@ from lfpiv_cli.optics.media import Media
 from lfpiv_cli.optics.tracing import ObjectSpace
 from lfpiv_cli.paper.small_rig import Rig, Search
 from lfpiv_cli.particles.view import raw_view
-from lfpiv_cli.synthetic.render import Balls, render_points, render_white
-from lfpiv_cli.synthetic.sensor import Readout
+from lfpiv_cli.synthetic.render import Balls, Readout, render_points, render_white
 from lfpiv_cli.validation.planning import (
     Tracer,
     errors_alone_mm,

@@ -20,7 +20,7 @@ from lfpiv_cli.paper.discussion import (
 )
 from lfpiv_cli.paper.parts import Work
 from lfpiv_cli.reconstruction.solvers import SolverSettings
-from lfpiv_cli.synthetic.sensor import Readout
+from lfpiv_cli.synthetic.render import Readout
 
 WATER = Media(1.0, 1.49, 1.33)
 

@@ -7,8 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from lfpiv_cli.fields.fit import KrigedField, is_rough, kriged_field
-from lfpiv_cli.fields.samples import Samples
-from lfpiv_cli.fields.structure import INDEPENDENT, VectorStructure, estimated, unknown_variance
+from lfpiv_cli.fields.structure import INDEPENDENT, Samples, VectorStructure, estimated, unknown_variance
 
 BOX_MM = np.array([6.0, 5.0, 5.0])
 LATERAL_MM, DEPTH_MM = 0.001, 0.015

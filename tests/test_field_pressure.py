@@ -12,9 +12,9 @@ from benchmarks.pressure import sequence_of, trial
 from lfpiv_cli.errors import ConfigError, InputError, UsageError
 from lfpiv_cli.fields import pressure, stencils
 from lfpiv_cli.fields.pressure import laplacian_at, pressure_field, pressure_gradients
-from lfpiv_cli.fields.samples import Samples
 from lfpiv_cli.fields.spline_field import spline_field
 from lfpiv_cli.fields.stencils import Lattice
+from lfpiv_cli.fields.structure import Samples
 from lfpiv_cli.files.config import load_config
 from lfpiv_cli.files.particle_file import Points
 from lfpiv_cli.reference import FOCAL_POINT

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from benchmarks.field_tracks import tracks_of
-from lfpiv_cli.fields.samples import Samples
 from lfpiv_cli.fields.spline_field import gradient_covariance_at, spline_field
 from lfpiv_cli.fields.stencils import Lattice, rows_of
-from lfpiv_cli.fields.turbulence import (
+from lfpiv_cli.fields.structure import Samples
+from lfpiv_cli.flow.field import (
     dissipation,
     fluctuations,
     kinetic_energy,

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from lfpiv_cli.flow.combining import Paths, WindowGrid, vectors_from_paths
 from lfpiv_cli.flow.field import REJECTED, VALID
-from lfpiv_cli.flow.from_tracks import Paths, WindowGrid, vectors_from_paths
 from lfpiv_cli.grid import Grid
 
 VOLUME = Grid.centred((40, 30, 20), (0.1, 0.1, 0.2), (0.0, 0.0, 0.0))

@@ -15,7 +15,8 @@ from numba import config
 
 from lfpiv_cli import simd
 from lfpiv_cli.flow.deformation import deform_pair, spline_coefficients
-from lfpiv_cli.flow.sums import MOMENTS, map_sums, margins, pair_moments
+from lfpiv_cli.flow.moments import MOMENTS, pair_moments
+from lfpiv_cli.flow.sums import map_sums, margins
 from lfpiv_cli.flow.windows import layout_windows
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.names import Layout

@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, shift
 
 from benchmarks.volumes import Seeding, volume_pair
-from lfpiv_cli.flow.moments import gauss_newton
-from lfpiv_cli.flow.sums import margins, pair_moments
+from lfpiv_cli.flow.moments import gauss_newton, pair_moments
+from lfpiv_cli.flow.sums import margins
 from lfpiv_cli.flow.windows import WindowLayout, cells_of, layout_windows
 
 HALF = (0.5, 0.5, 0.5)

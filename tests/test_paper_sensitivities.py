@@ -59,7 +59,7 @@ def believed_depth_mm(case: Case, z_mm: NDArray[np.float64]) -> NDArray[np.float
 def lines_of(influence: Influence, slopes: dict[str, float]) -> Measured:
     """An influence whose figures are straight lines of these slopes, faint ones for all others."""
     values = np.array(influence.values[1])
-    names = {series.figure for panel in influence.panels for series in panel.series}
+    names = {figure for panel in influence.panels for figure in panel.series}
     names |= {each.figure for each in influence.sensitivities}
     return Measured(influence, values, {name: slopes.get(name, FAINT) * values[:, np.newaxis] for name in names})
 
@@ -224,7 +224,7 @@ def test_from_where_tracers_crowd(recall: tuple[float, ...], told: str):
 def test_pictures_show_all_series(influence: Influence):
     drawing = drawing_of(by_theory(influence))
     labels = [text.get_text() for axes in drawing.figure.axes for text in axes.get_legend().get_texts()]
-    assert labels == [series.label for panel in influence.panels for series in panel.series]
+    assert labels == [label for panel in influence.panels for label in panel.series.values()]
 
 
 def test_each_influence_has_a_picture_of_its_own():

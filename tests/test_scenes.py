@@ -16,7 +16,7 @@ from lfpiv_cli.optics.media import Media, channel_window, fluid_path_to_focus
 from lfpiv_cli.optics.tracing import ObjectSpace
 from lfpiv_cli.synthetic.board import BoardPlacement
 from lfpiv_cli.synthetic.flows import Pulsation, advect, random_modes, rigid_rotation, uniform
-from lfpiv_cli.synthetic.render import Balls, render_points
+from lfpiv_cli.synthetic.render import Balls, Readout, render_points
 from lfpiv_cli.synthetic.scenes import (
     Box,
     Misalignment,
@@ -29,7 +29,6 @@ from lfpiv_cli.synthetic.scenes import (
     simulate_particles,
     simulate_white,
 )
-from lfpiv_cli.synthetic.sensor import Readout
 
 AIR = ObjectSpace(Media())
 NOISELESS = Readout(None, 0.0, 96.0)

@@ -10,7 +10,6 @@ from scipy.interpolate import BSpline
 from lfpiv_cli.fields import stencils
 from lfpiv_cli.fields.evidence import first_expectation, most_probable
 from lfpiv_cli.fields.fit import FEW_SAMPLES, Field, fit_field
-from lfpiv_cli.fields.samples import Samples, belonging, with_places, without_itself
 from lfpiv_cli.fields.spline_field import SplineField, lattice_for
 from lfpiv_cli.fields.stencils import (
     DIVERGENCE,
@@ -22,6 +21,7 @@ from lfpiv_cli.fields.stencils import (
     expected_inverse,
     factorised,
 )
+from lfpiv_cli.fields.structure import Samples, belonging, with_places, without_itself
 
 LATTICE = Lattice((-1.0, 0.5, 2.0), (0.5, 0.7, 0.6), (4, 2, 1))
 # So many samples are fitted by splines, not kriged.

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from lfpiv_cli.flow.deformation import MOST_TAPS, NEIGHBOURS, gather_taps, interpolate
-from lfpiv_cli.flow.sums import MOMENTS, map_sums, margins, pair_moments
+from lfpiv_cli.flow.moments import MOMENTS, pair_moments
+from lfpiv_cli.flow.sums import map_sums, margins
 from lfpiv_cli.flow.windows import layout_windows
 
 

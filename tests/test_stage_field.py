@@ -14,7 +14,7 @@ import pytest
 
 from lfpiv_cli.console import Console
 from lfpiv_cli.errors import InputError, UsageError
-from lfpiv_cli.fields.samples import Samples
+from lfpiv_cli.fields.structure import Samples
 from lfpiv_cli.files import vtkhdf
 from lfpiv_cli.files.config import Config, load_config
 from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, TRACKS_FORMAT, Points, read_tracks, write_points

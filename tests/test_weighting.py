@@ -14,8 +14,8 @@ from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.files.config import load_config
 from lfpiv_cli.flow.correlation import Coarse, correlate, plan
 from lfpiv_cli.flow.field import VectorField
-from lfpiv_cli.flow.moments import gauss_newton
-from lfpiv_cli.flow.sums import map_sums, margins, pair_moments
+from lfpiv_cli.flow.moments import gauss_newton, pair_moments
+from lfpiv_cli.flow.sums import map_sums, margins
 from lfpiv_cli.flow.windows import WEIGHTINGS, CorrelationSettings, WindowLayout, cells_of, layout_windows
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.names import Weighting, names_in

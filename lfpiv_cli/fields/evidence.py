@@ -19,8 +19,8 @@ from scipy.linalg import cho_factor, cho_solve
 
 from lfpiv_cli.arrays import Floats
 from lfpiv_cli.fields import stencils
-from lfpiv_cli.fields.samples import Samples, belonging, error_covariance, without_itself
 from lfpiv_cli.fields.stencils import DIVERGENCE, ORDERS, Expectation, Lattice, bound, inverse_of, penalty
+from lfpiv_cli.fields.structure import Samples, belonging, error_covariance, without_itself
 from lfpiv_cli.threads import in_threads
 
 # Cells of a box along each axis: some thousand unknowns.

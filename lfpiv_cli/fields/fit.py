@@ -16,11 +16,11 @@ from scipy.special import gammaincinv
 from threadpoolctl import threadpool_limits
 
 from lfpiv_cli.arrays import Floats
-from lfpiv_cli.fields.samples import Samples
 from lfpiv_cli.fields.spline_field import SplineField, lattice_for, spline_field
 from lfpiv_cli.fields.structure import (
     INDEPENDENT,
     Estimates,
+    Samples,
     VectorStructure,
     between,
     estimated,

@@ -23,7 +23,6 @@ import numpy as np
 from lfpiv_cli.arrays import Floats
 from lfpiv_cli.fields.evidence import Box, first_expectation, most_probable
 from lfpiv_cli.fields.fit import Field
-from lfpiv_cli.fields.samples import Samples, belonging, error_covariance, squares
 from lfpiv_cli.fields.spline_field import LAST_CHANGE, POINTS_AT_ONCE, ROUNDS, SplineField, gradient_covariance_at
 from lfpiv_cli.fields.stencils import (
     DEGREE,
@@ -39,6 +38,7 @@ from lfpiv_cli.fields.stencils import (
     gradient_rows,
     rows_of,
 )
+from lfpiv_cli.fields.structure import Samples, belonging, error_covariance, squares
 from lfpiv_cli.robust import MAD_TO_SIGMA
 
 # Gradients of a scalar as samples: what each spline has of them, and their part of the normal equations.

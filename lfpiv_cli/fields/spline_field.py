@@ -14,7 +14,6 @@ import numpy as np
 from lfpiv_cli.arrays import Floats
 from lfpiv_cli.fields import stencils
 from lfpiv_cli.fields.evidence import FREE_DIVERGENCE, divergence_weight, first_expectation, most_probable
-from lfpiv_cli.fields.samples import Samples, belonging, error_covariance, squares, with_places
 from lfpiv_cli.fields.stencils import (
     DIVERGENCE,
     SECOND,
@@ -30,6 +29,7 @@ from lfpiv_cli.fields.stencils import (
     gradient_rows,
     rows_of,
 )
+from lfpiv_cli.fields.structure import Samples, belonging, error_covariance, squares, with_places
 
 # Knots are so many times the samples' mean distance apart: a third as many knots as samples. Among factors of 1.2 to
 # 1.8, less adds noise where samples are few, and more holds divergence and values of small vortices further off.

@@ -268,13 +268,8 @@ def plane_block(matrix: Stencil, row: int, column: int) -> Floats:
 
 def dense(matrix: Stencil) -> Floats:
     """Return the whole matrix; for small ones."""
-    planes = matrix.shape[0]
-    size = matrix.shape[1] * matrix.shape[2] * matrix.shape[3]
-    whole = np.zeros((planes, size, planes, size))
-    for row in range(planes):
-        for column in range(max(0, row - DEGREE), min(planes, row + DEGREE + 1)):
-            whole[row, :, column] = plane_block(matrix, row, column)
-    return whole.reshape(planes * size, planes * size)
+    planes = range(matrix.shape[0])
+    return _block(matrix, planes, planes)
 
 
 # What a spline field is expected to be before any sample is seen: smooth, and of little divergence.

@@ -24,10 +24,10 @@ from lfpiv_cli.arrays import Floats
 from lfpiv_cli.errors import ConfigError, InputError
 from lfpiv_cli.flow.deformation import Spline, deform_pair, matrices_to_voxels, spline_coefficients, spline_matrix
 from lfpiv_cli.flow.field import VectorField
-from lfpiv_cli.flow.moments import gauss_newton
+from lfpiv_cli.flow.moments import MOMENTS, gauss_newton, pair_moments
 from lfpiv_cli.flow.outliers import expected_noise, fill_field, mixing, smooth_field, unresolved, validate_vectors
 from lfpiv_cli.flow.peaks import ELONGATED_WIDTH, Peaks, absolute, find_peaks, typical_width, undiluted
-from lfpiv_cli.flow.sums import MOMENTS, MapSums, map_sums, margins, pair_moments, valid_shares
+from lfpiv_cli.flow.sums import MapSums, map_sums, margins, valid_shares
 from lfpiv_cli.flow.windows import CorrelationSettings, Triple, WindowLayout, cells_of, triple
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.threads import share_out

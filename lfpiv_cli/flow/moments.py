@@ -15,14 +15,22 @@ Axes: cells and windows are ordered (z, y, x); vectors hold (u, v, w) along (x, 
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
 from lfpiv_cli.arrays import Floats
-from lfpiv_cli.flow.sums import MOMENTS, PRODUCTS, UNKNOWNS
-from lfpiv_cli.flow.windows import Triple, WindowLayout, cells_of, triple
-from lfpiv_cli.threads import share_out
+from lfpiv_cli.flow.sums import WeightedVoxels, weight_matrices, weighted_sums
+from lfpiv_cli.flow.windows import Starts, Triple, WindowLayout, cells_of, triple
+from lfpiv_cli.threads import COUNT_NO_REFERENCES, share_out
 
+# Three components and the gain. Moments are those of their derivatives, and those of these with B - A.
+UNKNOWNS = 4
+PRODUCTS = UNKNOWNS * (UNKNOWNS + 1) // 2
+# And the squares of the slopes of their difference.
+MOMENTS = PRODUCTS + UNKNOWNS + 3
 # A group is at least this many standard deviations of a particle image long: smaller ones share their particles, and
 # the spread of what they say is then too small.
 GROUP_SIGMAS = 2.0
@@ -33,6 +41,155 @@ FEWEST_GROUPS = 3
 SMALLEST_PIVOT = 1e-6
 # With a smaller response the volumes' slopes have next to nothing in common: errors stated are then large enough.
 SMALLEST_RESPONSE = 0.25
+
+Row = NDArray[np.float32]
+
+
+def pair_moments(
+    a: NDArray[np.float32], b: NDArray[np.float32], valid: NDArray[np.uint8], layout: WindowLayout, before: Triple
+) -> Floats:
+    """Return the moments of all cells of two deformed volumes; of several pairs these add up.
+
+    Parameters
+    ----------
+    a, b, valid : of `deform_pair`, with a margin of at least 1 around all windows
+    layout : windows, in voxels of the volume without margins
+    before : the margins before the volume, (z, y, x)
+    """
+    cells = cells_of(layout)
+    first = triple(low + margin for low, margin in zip(layout.first[::-1], before, strict=True))
+    count = tuple(starts.size for starts in cells.start)
+    if not layout.is_weighted:
+        found = np.empty((*count, MOMENTS))
+        share_out(sum_cells, count[0] * count[1], (a, b), valid, first, cells.start, cells.size, found)
+        return found
+    weights = weight_matrices(layout, cells)
+    here, steps = WeightedVoxels(first, weights), ((0, 0, 1), (0, 1, 0), (1, 0, 0))
+
+    def moments_of(z: int) -> Iterator[NDArray[np.float32]]:
+        """The terms of `sum_cells`, in its order."""
+        mean, difference = 0.5 * (here.of(a, z) + here.of(b, z)), here.of(b, z) - here.of(a, z)
+        kept, of_mean, of_difference = here.of(valid, z).astype(np.float32), [], []
+        for dz, dy, dx in steps:
+            a_before, b_before = (here.of(volume, z - dz, -dy, -dx) for volume in (a, b))
+            a_after, b_after = (here.of(volume, z + dz, dy, dx) for volume in (a, b))
+            of_mean.append(0.25 * ((a_after + b_after) - (a_before + b_before)))
+            of_difference.append(0.25 * ((b_after - a_after) - (b_before - a_before)))
+            kept = kept * here.of(valid, z - dz, -dy, -dx) * here.of(valid, z + dz, dy, dx)
+        of_mean.append(mean)
+        yield from (kept * one * other for number, one in enumerate(of_mean) for other in of_mean[number:])
+        yield from (kept * one * difference for one in of_mean)
+        yield from (kept * one**2 for one in of_difference)
+
+    return weighted_sums(MOMENTS, moments_of, weights).transpose(0, 2, 3, 1).astype(np.float64, order="C")
+
+
+@njit(cache=True, nogil=True)
+def sum_cells(
+    part: tuple[int, int],
+    pair: tuple[NDArray[np.float32], NDArray[np.float32]],
+    valid: NDArray[np.uint8],
+    first: Triple,
+    start: Starts,
+    size: Starts,
+    found: Floats,
+) -> None:
+    """Write the moments of cells, rows `part` of (cells z, y, x, MOMENTS), of windows that begin at the voxel `first`.
+
+    The upper triangle of the products of (dM/dx, dM/dy, dM/dz, M), row by row, those of each with B - A, and the
+    squares of the slopes of (B - A) / 2. Voxels with a neighbour that is not valid are left out: their gradient would
+    be that of the rim.
+    """
+    a, b = pair
+    count = found.shape[:3]
+    row, plane = a.shape[2], a.shape[1] * a.shape[2]
+    flat_a, flat_b, flat_valid = a.reshape(a.size), b.reshape(b.size), valid.reshape(valid.size)
+    length = start[2][-1] + size[2][-1]
+    room = np.empty((MOMENTS + UNKNOWNS + 5, length), dtype=np.float32)
+    columns, rest, kept = room[:MOMENTS], room[-2], room[-1]
+    known, slopes = room[MOMENTS : MOMENTS + UNKNOWNS], room[MOMENTS + UNKNOWNS : -2]
+    for job in range(part[0], part[1]):
+        cz, cy = job // count[1], job % count[1]
+        begin = (first[0] + start[0][cz]) * plane + (first[1] + start[1][cy]) * row + first[2]
+        # Summed over the planes and rows of the cells first, many columns at once; float32 serves for so few.
+        columns[:] = 0.0
+        for z in range(size[0][cz]):
+            for y in range(size[1][cy]):
+                here = begin + z * plane + y * row
+                write_voxels(flat_a[here:], flat_b[here:], flat_valid[here:], known[3], rest, kept)
+                for axis in range(3):
+                    step = 1 if axis == 0 else row if axis == 1 else plane
+                    before, after = here - step, here + step
+                    write_slopes(
+                        (flat_a[before:], flat_a[after:]),
+                        (flat_b[before:], flat_b[after:]),
+                        (flat_valid[before:], flat_valid[after:]),
+                        (known[axis], slopes[axis], kept),
+                    )
+                moment = 0
+                for i in range(UNKNOWNS):
+                    multiply(known[i], kept)
+                for i in range(UNKNOWNS):
+                    for j in range(i, UNKNOWNS):
+                        add_product(columns[moment], known[i], known[j])
+                        moment += 1
+                for i in range(UNKNOWNS):
+                    add_product(columns[PRODUCTS + i], known[i], rest)
+                for i in range(3):
+                    multiply(slopes[i], kept)
+                    add_product(columns[PRODUCTS + UNKNOWNS + i], slopes[i], slopes[i])
+        for cx in range(count[2]):
+            for moment in range(MOMENTS):
+                total = 0.0
+                for x in range(start[2][cx], start[2][cx] + size[2][cx]):
+                    total += columns[moment, x]
+                found[cz, cy, cx, moment] = total
+
+
+@njit(cache=True, **COUNT_NO_REFERENCES)
+def write_voxels(a: Row, b: Row, valid: NDArray[np.uint8], mean: Row, rest: Row, kept: Row) -> None:
+    """Write the mean of two rows, their difference and which voxels are valid."""
+    for x in range(kept.size):
+        mean[x] = np.float32(0.5) * (a[x] + b[x])
+        rest[x] = b[x] - a[x]
+        kept[x] = np.float32(valid[x])
+
+
+@njit(cache=True, **COUNT_NO_REFERENCES)
+def write_slopes(
+    a: tuple[Row, Row],
+    b: tuple[Row, Row],
+    valid: tuple[NDArray[np.uint8], NDArray[np.uint8]],
+    out: tuple[Row, Row, Row],
+) -> None:
+    """Write the central differences of the mean and of half the difference, from the rows before and after each.
+
+    Voxels with a neighbour that is not valid are struck out of the last of `out`.
+    """
+    a_before, a_after = a
+    b_before, b_after = b
+    valid_before, valid_after = valid
+    of_mean, of_difference, kept = out
+    for x in range(kept.size):
+        rise_a, rise_b = a_after[x] - a_before[x], b_after[x] - b_before[x]
+        of_mean[x] = np.float32(0.25) * (rise_a + rise_b)
+        of_difference[x] = np.float32(0.25) * (rise_b - rise_a)
+    for x in range(kept.size):
+        kept[x] *= np.float32(valid_before[x] & valid_after[x])
+
+
+@njit(cache=True, **COUNT_NO_REFERENCES)
+def multiply(target: Row, factor: Row) -> None:
+    """Multiply a row by another."""
+    for x in range(target.size):
+        target[x] *= factor[x]
+
+
+@njit(cache=True, fastmath=True, **COUNT_NO_REFERENCES)
+def add_product(target: Row, one: Row, other: Row) -> None:
+    """Add the product of two rows to a row."""
+    for x in range(target.size):
+        target[x] += one[x] * other[x]
 
 
 def gauss_newton(moments: Floats, layout: WindowLayout, particle_sigma: Floats) -> tuple[Floats, Floats, Floats]:

@@ -16,14 +16,7 @@ from lfpiv_cli.files.pages import Table
 from lfpiv_cli.notice import written
 from lfpiv_cli.paper.parts import BOARD, MISALIGNED, Drawing, Findings, Row, Work, sections
 from lfpiv_cli.pictures.style import BLUE, Figure, new_panels, styled
-from lfpiv_cli.validation.weights import (
-    TABLE1_MM,
-    columns_figure,
-    make_columns,
-    sample_voxels,
-    similarity_figure,
-    weights_figures,
-)
+from lfpiv_cli.validation import weights
 from lfpiv_cli.verbs.calibrate import CalibrateOptions, calibrate_snapshot
 from lfpiv_cli.verbs.simulate import simulate_board, simulate_white
 from lfpiv_cli.weights.quadrature import PAPERS_COUNT
@@ -51,13 +44,13 @@ def table1(work: Work) -> Findings:
     settings = load_config(config)
     camera, grid, rng = settings.camera_model(), settings.grid(), np.random.default_rng(SEED)
     space = replace(settings.plane_space("comparing ways to make weights"), window=settings.window_model())
-    paper = np.array(TABLE1_MM)[: work.by_size(1, 5, 5)]
-    centres = np.concatenate([paper, sample_voxels(grid, work.by_size(0, 3, 20), rng)])
+    paper = np.array(weights.TABLE1_MM)[: work.by_size(1, 5, 5)]
+    centres = np.concatenate([paper, weights.sample_voxels(grid, work.by_size(0, 3, 20), rng)])
     long_count = np.zeros(len(centres), np.int64)
     long_count[: len(paper)] = work.by_size(0, 0, 100_000_000)
     with work.console.progress(len(centres), "weights") as advance:
-        columns = make_columns(camera, space, grid, centres, rng, long_count, advance)
-    figures = weights_figures(columns, long_count)
+        columns = weights.make_columns(camera, space, grid, centres, rng, long_count, advance)
+    figures = weights.weights_figures(columns, long_count)
     return Findings(
         rows=_rows(figures, len(paper)),
         drawings=(
@@ -66,12 +59,12 @@ def table1(work: Work) -> Findings:
                 "The weights of the paper's voxels as the sensor would see them (after Fig. 5): traced directly by "
                 "Snell's law, integrated over equivalent points, as they are in use, and counted as the paper did. A "
                 "row a voxel, one grey scale in each.",
-                columns_figure(columns[: len(paper)]),
+                weights.columns_figure(columns[: len(paper)]),
             ),
             Drawing(
                 "similarity",
                 "SSIM, RMSE and absolute difference by voxel (after Fig. 6).",
-                similarity_figure(figures, len(paper)),
+                weights.similarity_figure(figures, len(paper)),
             ),
         ),
         tables=(_table(figures),),
@@ -95,9 +88,9 @@ def _rows(figures: dict[str, Any], paper: int) -> tuple[Row, ...]:
     chance, used = figures["ray_count_to_converged"]["l1_mean"], figures["factorised_to_converged"]["l1_mean"]
     return (
         Row(
-            quantity="similarity (SSIM) of ERT and DRT weights, smallest",
-            source="Fig. 6",
-            limit=PAPERS_SSIM,
+            "similarity (SSIM) of ERT and DRT weights, smallest",
+            "Fig. 6",
+            PAPERS_SSIM,
             sense="at least",
             paper_ert=1.0,
             ert=min(each["ssim"] for each in counted),
@@ -105,27 +98,21 @@ def _rows(figures: dict[str, Any], paper: int) -> tuple[Row, ...]:
             reason=CHANCE,
         ),
         Row(
-            quantity="difference of ERT and DRT weights, largest RMSE (grey levels of 255)",
-            source="Fig. 6",
-            limit=PAPERS_RMSE_GREY,
+            "difference of ERT and DRT weights, largest RMSE (grey levels of 255)",
+            "Fig. 6",
+            PAPERS_RMSE_GREY,
             paper_ert=PAPERS_RMSE_GREY,
             ert=max(each["rmse_grey"] for each in counted),
             best=same["rmse_grey_largest"],
         ),
         Row(
-            quantity="ERT against DRT by Snell's law, largest share of a voxel's light",
-            source="Section 3.2",
-            limit=LIMIT_EXACT,
+            "ERT against DRT by Snell's law, largest share of a voxel's light",
+            "Section 3.2",
+            LIMIT_EXACT,
             ert=figures["ert_to_drt_exact"]["l1_largest"],
             best=exact["l1_largest"],
         ),
-        Row(
-            quantity="weights in use against the integral, mean share of light",
-            source="Eq. 13",
-            limit=chance,
-            ert=chance,
-            best=used,
-        ),
+        Row("weights in use against the integral, mean share of light", "Eq. 13", chance, ert=chance, best=used),
     )
 
 
@@ -179,14 +166,7 @@ def table2(work: Work) -> Findings:
     }
     rows = [(name, f"{value:g}", f"{ours[name]:g}") for name, value in PAPER.items()]
     return Findings(
-        rows=(
-            Row(
-                quantity="largest relative deviation from Table 2",
-                source="Table 2",
-                limit=LARGEST_DEVIATION,
-                best=deviation,
-            ),
-        ),
+        rows=(Row("largest relative deviation from Table 2", "Table 2", LARGEST_DEVIATION, best=deviation),),
         tables=(
             Table(
                 "Optical parameters",
@@ -240,18 +220,8 @@ def focal_plane(work: Work) -> Findings:
     off, corner = measured - true, "A corner of the sensor, 20 dots half a millimetre apart."
     return Findings(
         rows=(
-            Row(
-                quantity="place of the mid plane, largest error (mm)",
-                source="Eq. 21",
-                limit=LIMIT_MM,
-                best=float(np.abs(off).max()),
-            ),
-            Row(
-                quantity="the same, in stated standard errors",
-                source="Eq. 21",
-                limit=LIMIT_SIGMAS,
-                best=float(np.abs(off / sigma).max()),
-            ),
+            Row("place of the mid plane, largest error (mm)", "Eq. 21", LIMIT_MM, best=float(np.abs(off).max())),
+            Row("the same, in stated standard errors", "Eq. 21", LIMIT_SIGMAS, best=float(np.abs(off / sigma).max())),
         ),
         drawings=(
             Drawing(

@@ -22,7 +22,7 @@ from lfpiv_cli.paper.parts import Drawing, Findings, Work, sections
 from lfpiv_cli.particles.view import raw_view
 from lfpiv_cli.pictures.style import BLUE, GREEN, ORANGE, VERMILION, Figure, new_panels, styled
 from lfpiv_cli.reconstruction.solvers import SolverSettings, reconstruct
-from lfpiv_cli.synthetic.sensor import Readout
+from lfpiv_cli.synthetic.render import Readout
 from lfpiv_cli.validation.board import elongation_mm
 from lfpiv_cli.validation.planning import cramer_rao_bound, errors_alone_mm, expected_image, pixel_variance, slopes
 from lfpiv_cli.weights.build import default_padding, factorise

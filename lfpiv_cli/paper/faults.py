@@ -57,20 +57,14 @@ def faults_figure(over: Mapping[str, Mapping[str, float]], words: Mapping[str, s
         missed = not value <= 1.0
         colour = "black" if shade[row, column] > 1.0 else "white"
         weight = "bold" if missed else "normal"
-        axes.text(column, row, number(value), ha="center", va="center", fontsize=8, color=colour, fontweight=weight)
+        told = f"{value:.0e}".replace("e+0", "e") if value >= 1000.0 else f"{value:.{0 if value >= 9.95 else 1}f}"
+        axes.text(column, row, told, ha="center", va="center", fontsize=8, color=colour, fontweight=weight)
     axes.set_xticks(range(len(names)), [words[name] for name in names], rotation=40, ha="right", fontsize=8)
     axes.set_yticks(range(len(table)), list(over), fontsize=8)
     bar = figure.colorbar(image, ax=axes, ticks=range(int(DECADES[0]), int(DECADES[1]) + 1))
     bar.ax.set_yticklabels([f"{10.0**k:g}" for k in range(int(DECADES[0]), int(DECADES[1]) + 1)], fontsize=8)
     bar.set_label("error / limit (bold: missed)", fontsize=8)
     return figure
-
-
-def number(value: float) -> str:
-    """Return a ratio in few characters."""
-    if value >= 1000.0:
-        return f"{value:.0e}".replace("e+0", "e")
-    return f"{value:.0f}" if value >= 9.95 else f"{value:.1f}"
 
 
 SEED_OF_LIMITS, SEED = 100, 1
@@ -275,18 +269,18 @@ def fault_rows(figures: Mapping[str, Figures], good_figures: Figures, limits: Ma
         # by how many times its limit the worst figure of a mistake is off: it is to fail
         worst = max(over, key=over.__getitem__)
         row = Row(
-            quantity=f"{fault}: {WORDS[worst].text}, over its limit",
-            source="planted mistake",
-            limit=1.0,
+            f"{fault}: {WORDS[worst].text}, over its limit",
+            "planted mistake",
+            1.0,
             sense="at least",
             best=over[worst] if said else 0.0,
             reason="" if said else "validation does not fail: no figure misses its limit",
         )
         rows.append(row)
     none = Row(
-        quantity="no mistake: figures that miss their limit",
-        source="good measurement",
-        limit=0.0,
+        "no mistake: figures that miss their limit",
+        "good measurement",
+        0.0,
         best=float(len(missed_limits(good_figures, limits))),
         reason=said_to(good_figures, limits),
     )

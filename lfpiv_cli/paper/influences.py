@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 
@@ -15,23 +15,19 @@ Values = tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]
 
 
 @dataclass(frozen=True)
-class Series:
-    """A curve of a panel: the figure that is drawn, and what turns it into the panel's unit.
+class Panel:
+    """A panel of a picture; where a sensitivity is a slope, the straight line of its figure is drawn as well.
 
-    Where a sensitivity is a slope, the straight line of its figure is drawn as well.
+    Attributes
+    ----------
+    series : the figures that its curves show, and what they are called
+    factor : gives figures the panel's unit
+    at_least : its axis shows errors of this size, so that noise alone does not fill it
     """
 
-    figure: str
     label: str
+    series: Mapping[str, str]
     factor: float = 1.0
-
-
-@dataclass(frozen=True)
-class Panel:
-    """A panel of a picture; its axis shows errors of `at_least` this size, so that noise alone does not fill it."""
-
-    label: str
-    series: tuple[Series, ...]
     logarithmic: bool = False
     at_least: float = 0.0
 
@@ -99,26 +95,17 @@ def around(largest: float, middle: float = 0.0) -> Values:
 PAPER_PER_PIXEL = 0.002
 PAPER_PER_LENS = float(PAPER_PER_PIXEL * sheet().micro_image_lattice_px().pitch[0] ** 2)
 
+BY_RAYS = {"paraxial": "rays taken as paraxial", "exact": "rays by Snell's law"}
 F_NUMBERS = Influence(
-    name="f-number",
-    label="f-number of the main lens",
-    values=((4.0, 8.0), (2.8, 4.0, 8.0), (2.8, 3.3, 4.0, 4.8, 5.6, 6.7, 8.0)),
-    measure=small_rig.at_f_number,
-    panels=(
+    "f-number",
+    "f-number of the main lens",
+    ((4.0, 8.0), (2.8, 4.0, 8.0), (2.8, 3.3, 4.0, 4.8, 5.6, 6.7, 8.0)),
+    small_rig.at_f_number,
+    (
         Panel(
-            "error of depth behind 134 mm of water (mm)",
-            (
-                Series("paraxial_offset_z", "rays taken as paraxial", 1.0),
-                Series("exact_offset_z", "rays by Snell's law"),
-            ),
+            "error of depth behind 134 mm of water (mm)", {f"{rays}_offset_z": words for rays, words in BY_RAYS.items()}
         ),
-        Panel(
-            "spread of depth (um)",
-            (
-                Series("paraxial_spread_z", "rays taken as paraxial", 1e3),
-                Series("exact_spread_z", "rays by Snell's law", 1e3),
-            ),
-        ),
+        Panel("spread of depth (um)", {f"{rays}_spread_z": words for rays, words in BY_RAYS.items()}, 1e3),
     ),
     typical=(F_NUMBER**-2, "f/4, paraxial"),
     sensitivities=(
@@ -142,14 +129,13 @@ FAINT, LARGEST_OVER_BOUND = 0.1, 1.5
 DEPTH_AND_X = {"z": "depth", "x": "x"}
 
 NOISE = Influence(
-    name="noise",
-    label="read noise over the light of a lit pixel",
-    values=((0.0, 0.1), (0.0, 0.1, 0.2), (0.0, 0.05, 0.1, 0.15, 0.2, 0.3)),
-    measure=small_rig.in_noise,
-    panels=tuple(
+    "noise",
+    "read noise over the light of a lit pixel",
+    ((0.0, 0.1), (0.0, 0.1, 0.2), (0.0, 0.05, 0.1, 0.15, 0.2, 0.3)),
+    small_rig.in_noise,
+    tuple(
         Panel(
-            f"spread of {what} (um)",
-            (Series(f"spread_{name}", "measured", 1e3), Series(f"bound_{name}", "Cramer-Rao bound (median)", 1e3)),
+            f"spread of {what} (um)", {f"spread_{name}": "measured", f"bound_{name}": "Cramer-Rao bound (median)"}, 1e3
         )
         for name, what in DEPTH_AND_X.items()
     ),
@@ -162,16 +148,16 @@ NOISE = Influence(
     "{error}, and a velocity by that, times 1.4, over the time between the images.",
     repeats=2,
 )
-
 DISTANCE = Influence(
-    name="depth",
-    label="distance of the tracers from the focal plane (mm)",
-    values=((1.0, 5.0), (0.25, 3.0, 10.0), (0.25, 1.0, 2.0, 3.5, 5.0, 7.5, 10.0)),
-    measure=small_rig.at_depth,
-    panels=tuple(
+    "depth",
+    "distance of the tracers from the focal plane (mm)",
+    ((1.0, 5.0), (0.25, 3.0, 10.0), (0.25, 1.0, 2.0, 3.5, 5.0, 7.5, 10.0)),
+    small_rig.at_depth,
+    tuple(
         Panel(
             f"error of {what} (um)",
-            (Series(f"spread_{name}", "typical (1.48 times the median)", 1e3), Series(f"rms_{name}", "rms", 1e3)),
+            {f"spread_{name}": "typical (1.48 times the median)", f"rms_{name}": "rms"},
+            1e3,
             logarithmic=True,
         )
         for name, what in DEPTH_AND_X.items()
@@ -185,31 +171,30 @@ DISTANCE = Influence(
     "{error} rms, as light stays within a lens and the side of the plane is hard to tell.",
     repeats=2,
 )
-
 SEEDING = Influence(
-    name="seeding",
-    label="tracers for each microlens",
-    values=((0.1, 0.3), (0.1, 0.67, 1.2), (0.1, 0.25, 0.67, 1.2, 2.0, 4.0)),
-    measure=small_rig.crowded,
-    panels=(
+    "seeding",
+    "tracers for each microlens",
+    ((0.1, 0.3), (0.1, 0.67, 1.2), (0.1, 0.25, 0.67, 1.2, 2.0, 4.0)),
+    small_rig.crowded,
+    (
         Panel(
             "share, and slope of w",
-            (
-                Series("recall", "tracers found"),
-                Series("precision", "of those found, true"),
-                Series("tracks_slope_w", "slope of w, particles"),
-                Series("volumes_slope_w", "slope of w, volumes"),
-            ),
+            {
+                "recall": "tracers found",
+                "precision": "of those found, true",
+                "tracks_slope_w": "slope of w, particles",
+                "volumes_slope_w": "slope of w, volumes",
+            },
         ),
         Panel(
             "rms error (mm)",
-            (
-                Series("rms_z", "depth of a tracer"),
-                Series("tracks_rms_w", "displacement in depth, particles"),
-                Series("volumes_rms_w", "displacement in depth, volumes"),
-                Series("tracks_rms_u", "lateral displacement, particles"),
-                Series("volumes_rms_u", "lateral displacement, volumes"),
-            ),
+            {
+                "rms_z": "depth of a tracer",
+                "tracks_rms_w": "displacement in depth, particles",
+                "volumes_rms_w": "displacement in depth, volumes",
+                "tracks_rms_u": "lateral displacement, particles",
+                "volumes_rms_u": "lateral displacement, volumes",
+            },
             logarithmic=True,
         ),
     ),
@@ -223,7 +208,6 @@ SEEDING = Influence(
     logarithmic=True,
 )
 
-
 # Influences that displace places: a number of the rig that is believed and wrong.
 
 # Where errors that grow from the middle are told: so deep from the mid plane, and so far from the axis, the paper's
@@ -236,10 +220,11 @@ LEVER = SHEET.image_distance_mm / SHEET.microlens_distance_mm
 SLANT_PER_MM = LEVER / SHEET.focus_distance_mm * WATER.depth_ratio
 TURN_PER_DEG = float(np.deg2rad(1.0))
 
-DEPTH = Panel("error of depth (mm)", (Series("offset_z", "in the middle of the channel", 1.0),))
-SCALES = (Series("stretch_z", "along the depth", 100.0), Series("stretch_x", "lateral", 100.0))
-FOUND = Panel("found of the tracers", (Series("recall", "found"), Series("precision", "of those found, true")))
-VELOCITY = Panel("error of velocities (%)", SCALES, at_least=1.0)
+DEPTH = Panel("error of depth (mm)", {"offset_z": "in the middle of the channel"})
+FOUND = Panel("found of the tracers", {"recall": "found", "precision": "of those found, true"})
+VELOCITY = Panel(
+    "error of velocities (%)", {"stretch_z": "along the depth", "stretch_x": "lateral"}, 100.0, at_least=1.0
+)
 # With the focal plane 2 mm off, tracers from deeper than this are believed to be in the wall.
 SHALLOW_MM = 2.0
 
@@ -252,11 +237,11 @@ def in_places(case: Callable[[float], Case], value: float, seed: int, half_depth
 
 
 INDEX = Influence(
-    name="index",
-    label="index of the fluid that is believed (true: 1.33)",
-    values=around(0.03, WATER.fluid),
-    measure=partial(in_places, small_rig.index_wrong),
-    panels=(DEPTH, VELOCITY),
+    "index",
+    "index of the fluid that is believed (true: 1.33)",
+    around(0.03, WATER.fluid),
+    partial(in_places, small_rig.index_wrong),
+    (DEPTH, VELOCITY),
     typical=(0.005, "0.005: temperature or solution not measured"),
     sensitivities=(
         Sensitivity(
@@ -274,13 +259,12 @@ INDEX = Influence(
     advice="Measure the index of the fluid at its temperature: 0.005 puts depths off by {error}, more with the "
     "distance from the inner wall, and velocities along the depth by as much as it is of the index.",
 )
-
 FOCUS = Influence(
-    name="focus",
-    label="focal plane believed to lie farther than it does (mm in air)",
-    values=around(2.0),
-    measure=partial(in_places, small_rig.focus_wrong, half_depth_mm=SHALLOW_MM),
-    panels=(DEPTH, VELOCITY),
+    "focus",
+    "focal plane believed to lie farther than it does (mm in air)",
+    around(2.0),
+    partial(in_places, small_rig.focus_wrong, half_depth_mm=SHALLOW_MM),
+    (DEPTH, VELOCITY),
     typical=(0.1, "0.1 mm: focused by eye"),
     sensitivities=(
         Sensitivity("offset_z", "depth", "mm per mm", 1.0, expected=WATER.fluid / WATER.air, tolerance=0.03),
@@ -301,13 +285,12 @@ FOCUS = Influence(
     advice="Measure where the focal plane lies by a snapshot of a board, and do not touch the focus afterwards: 0.1 mm "
     "puts all depths off by {error}.",
 )
-
 WALL = Influence(
-    name="wall",
-    label="wall believed to be thicker than it is (mm)",
-    values=around(1.0),
-    measure=partial(in_places, small_rig.wall_wrong),
-    panels=(DEPTH, VELOCITY),
+    "wall",
+    "wall believed to be thicker than it is (mm)",
+    around(1.0),
+    partial(in_places, small_rig.wall_wrong),
+    (DEPTH, VELOCITY),
     typical=(0.3, "0.3 mm: the tolerance of a 5 mm sheet of acrylic"),
     sensitivities=(
         Sensitivity("offset_z", "depth", "mm per mm", 1.0, expected=-WATER.fluid / WATER.window, tolerance=0.03),
@@ -316,13 +299,12 @@ WALL = Influence(
     "sold: 0.3 mm puts all depths off by {error}, and leaves velocities alone but where the wall of the flow "
     "is.",
 )
-
 SHIFT = Influence(
-    name="lattice-shift",
-    label="lens images believed to lie farther along x (pixels)",
-    values=((-0.3, 0.3), (-0.3, 0.0, 0.3), (-1.0, -0.5, -0.2, 0.0, 0.2, 0.5, 1.0)),
-    measure=partial(in_places, small_rig.lattice_shifted),
-    panels=(Panel("slant of x over depth (um/mm)", (Series("slant_x", "x per depth, w into u", 1e3),)), FOUND),
+    "lattice-shift",
+    "lens images believed to lie farther along x (pixels)",
+    ((-0.3, 0.3), (-0.3, 0.0, 0.3), (-1.0, -0.5, -0.2, 0.0, 0.2, 0.5, 1.0)),
+    partial(in_places, small_rig.lattice_shifted),
+    (Panel("slant of x over depth (um/mm)", {"slant_x": "x per depth, w into u"}, 1e3), FOUND),
     typical=(0.05, "0.05 px: an older white image"),
     sensitivities=(
         Sensitivity(
@@ -337,19 +319,16 @@ SHIFT = Influence(
     advice="Take the white image on the day of the measurement: lens images 0.05 px off slant lateral places "
     "by {error}, and a whole pixel off hardly a tracer is found.",
 )
-
 TURN = Influence(
-    name="lattice-turn",
-    label="lattice believed to be turned further (degrees)",
-    values=around(0.15),
-    measure=partial(in_places, small_rig.lattice_turned),
-    panels=(
+    "lattice-turn",
+    "lattice believed to be turned further (degrees)",
+    around(0.15),
+    partial(in_places, small_rig.lattice_turned),
+    (
         Panel(
             "turn of lateral places",
-            (
-                Series("turn", "in the focal plane (degrees)", 1.0 / TURN_PER_DEG),
-                Series("twist", "more for each mm of depth (degrees/mm)", 1.0 / TURN_PER_DEG),
-            ),
+            {"turn": "in the focal plane (degrees)", "twist": "more for each mm of depth (degrees/mm)"},
+            1.0 / TURN_PER_DEG,
         ),
         FOUND,
     ),
@@ -367,3 +346,5 @@ TURN = Influence(
     advice="Take the white image with the camera as it measures: a lattice turned by 0.005 degrees twists places by "
     "{error}, and what it hides grows with the distance from the axis.",
 )
+
+INFLUENCES = (SEEDING, F_NUMBERS, FOCUS, WALL, INDEX, SHIFT, TURN, NOISE, DISTANCE)

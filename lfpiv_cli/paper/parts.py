@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypeVar
+from typing import Any, Literal, TypeVar
 
 import yaml
 
@@ -18,10 +18,7 @@ from lfpiv_cli.files.atomic import write_json, write_text
 from lfpiv_cli.files.inputs import ensure_regular_file, reason
 from lfpiv_cli.files.pages import Table
 from lfpiv_cli.names import Size
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
+from lfpiv_cli.pictures.style import Figure
 
 TABLE_2: dict[str, Any] = {
     "camera": {
@@ -73,7 +70,7 @@ Value = TypeVar("Value")
 Verdict = Literal["met", "missed", "unknown"]
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Row:
     """One quantity: the paper's values, ours, and what ours are held to.
 

@@ -11,17 +11,8 @@ from typing import Any
 
 from lfpiv_cli.console import CONSOLE, Console
 from lfpiv_cli.errors import LimitMissedError
+from lfpiv_cli.files import pages
 from lfpiv_cli.files.atomic import ensure_writable, write_json
-from lfpiv_cli.files.pages import (
-    Page,
-    Picture,
-    Section,
-    Table,
-    ensure_drawing,
-    ensure_pages,
-    write_pages,
-    write_picture,
-)
 from lfpiv_cli.files.provenance import record
 from lfpiv_cli.names import PaperPart, Size
 from lfpiv_cli.notice import written
@@ -34,8 +25,6 @@ from lfpiv_cli.paper.sensitivities import sensitivities
 from lfpiv_cli.paper.table3 import table3
 from lfpiv_cli.paper.table4 import table4
 
-# The parts of the report, in the order in which they are made and shown; a new one is a line here and in `names`.
-
 
 @dataclass(frozen=True)
 class Part:
@@ -47,6 +36,7 @@ class Part:
     full_minutes: float
 
 
+# The parts of the report, in the order in which they are made and shown; a new one is a line here and in `names`.
 PARTS: dict[PaperPart, Part] = {
     "table1": Part(table1, "Weights of single voxels (Table 1, Figs. 5 and 6)", 0.5, 4.0),
     "table2": Part(table2, "The camera (Table 2)", 0.01, 0.01),
@@ -82,7 +72,9 @@ SIZES: dict[Size, str] = {
 }
 
 
-def page_of(parts: Mapping[PaperPart, Mapping[str, Any]], folder: Path, size: Size, made: Mapping[str, Any]) -> Page:
+def page_of(
+    parts: Mapping[PaperPart, Mapping[str, Any]], folder: Path, size: Size, made: Mapping[str, Any]
+) -> pages.Page:
     """Return the page of parts, whose pictures lie below a folder."""
     rows = [row for part in parts.values() for row in rows_of(part["rows"])]
     met = sum(row.verdict == "met" for row in rows)
@@ -96,31 +88,29 @@ def page_of(parts: Mapping[PaperPart, Mapping[str, Any]], folder: Path, size: Si
         f"The parts took {minutes:.0f} minutes.",
     )
     notes = tuple(f"{row.quantity} ({row.source}): {row.reason}" for row in rows if row.reason)
-    table = Table("All quantities", HEAD, tuple(_cells(row) for row in rows))
+    table = pages.Table("All quantities", HEAD, tuple(_cells(row) for row in rows))
     sections = []
     for name, part in parts.items():
-        tables = [Table(t["caption"], tuple(t["head"]), tuple(map(tuple, t["rows"]))) for t in part["tables"]]
+        tables = [pages.Table(t["caption"], tuple(t["head"]), tuple(map(tuple, t["rows"]))) for t in part["tables"]]
         seeds = f"Seeds {', '.join(map(str, part['seeds']))}. " if part["seeds"] else ""
-        told = (*part["text"], f"{seeds}This part took {_duration(part['seconds'])}.")
-        pictures = [Picture(folder / each["path"], each["caption"]) for each in part["pictures"]]
+        seconds = part["seconds"]
+        took = f"{seconds:.0f} s" if seconds < 100.0 else f"{seconds / 60.0:.0f} min"
+        told = (*part["text"], f"{seeds}This part took {took}.")
+        pictures = [pages.Picture(folder / each["path"], each["caption"]) for each in part["pictures"]]
         again = f"lfpiv validate paper {'--quick ' if size == 'quick' else ''}-o . --resume --only {name}"
         commands = (*part["commands"], again)
-        sections.append(Section(PARTS[name].title, name, told, tuple(tables), tuple(pictures), commands))
+        sections.append(pages.Section(PARTS[name].title, name, told, tuple(tables), tuple(pictures), commands))
     libraries = ", ".join(f"{name} {version}" for name, version in made["libraries"].items())
     foot = f"Made by lfpiv {made['version']} ({libraries})."
     if notes:
-        sections.append(Section("Where ours as the paper did it differs, and why", "reasons", notes))
-    return Page(TITLE, text, (table,), tuple(sections), foot)
+        sections.append(pages.Section("Where ours as the paper did it differs, and why", "reasons", notes))
+    return pages.Page(TITLE, text, (table,), tuple(sections), foot)
 
 
 def _cells(row: Row) -> tuple[str, ...]:
     values = ("–" if v is None else written(v) for v in (row.paper_dlfc, row.paper_ert, row.dlfc, row.ert, row.best))
     sense = "≤" if row.sense == "at most" else "≥"
     return (row.quantity, *values, f"{sense} {written(row.limit, 4)}", row.verdict, row.source)
-
-
-def _duration(seconds: float) -> str:
-    return f"{seconds:.0f} s" if seconds < 100.0 else f"{seconds / 60.0:.0f} min"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -151,8 +141,8 @@ def validate_paper(
     again = overwrite or options.resume
     for path in paths.values():
         ensure_writable(path, again)
-    ensure_drawing()
-    ensure_pages()
+    pages.ensure_drawing()
+    pages.ensure_pages()
     made = record(f"validate paper, {options.size}", None, {})
     chosen = [name for name in PARTS if name in options.only or not options.only]
     minutes = {
@@ -175,7 +165,7 @@ def validate_paper(
         if path.exists() and (part := read_json(path)).get("made") == made:
             parts[name] = part["result"]
     page = page_of(parts, output, options.size, made)
-    write_pages(page, (paths["index.html"], paths["report.md"]), again)
+    pages.write_pages(page, (paths["index.html"], paths["report.md"]), again)
     write_json(paths["report.json"], {"parts": parts, "provenance": made}, again)
     rows = [row for part in parts.values() for row in rows_of(part["rows"])]
     count = {verdict: sum(row.verdict == verdict for row in rows) for verdict in ("met", "missed", "unknown")}
@@ -199,7 +189,7 @@ def _made(name: PaperPart, work: Work) -> dict[str, Any]:
     pictures = []
     for drawing in found.drawings:
         path = work.folder.parents[1] / "pictures" / f"{name}_{drawing.name}.png"
-        write_picture(path, drawing.figure, overwrite=True)
+        pages.write_picture(path, drawing.figure, overwrite=True)
         pictures.append({"path": f"pictures/{path.name}", "caption": drawing.caption})
     return {
         "rows": [asdict(row) | {"verdict": row.verdict} for row in found.rows],

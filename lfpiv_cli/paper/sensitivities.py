@@ -12,23 +12,8 @@ import numpy as np
 from lfpiv_cli.arrays import Floats
 from lfpiv_cli.files.pages import Table
 from lfpiv_cli.notice import written
-from lfpiv_cli.paper.influences import (
-    DISTANCE,
-    F_NUMBERS,
-    FAINT,
-    FOCUS,
-    INDEX,
-    LARGEST_OVER_BOUND,
-    NOISE,
-    PAPER_PER_LENS,
-    PAPER_PER_PIXEL,
-    SEEDING,
-    SHIFT,
-    TURN,
-    WALL,
-    Influence,
-    Sensitivity,
-)
+from lfpiv_cli.paper import influences
+from lfpiv_cli.paper.influences import INFLUENCES, NOISE, PAPER_PER_LENS, SEEDING, Influence, Sensitivity
 from lfpiv_cli.paper.parts import Drawing, Findings, Row, Work
 from lfpiv_cli.pictures.style import BLUE, GREEN, ORANGE, PURPLE, VERMILION, new_panels, styled
 
@@ -40,7 +25,6 @@ MARKS, DASHES = ("o", "s", "^", "D", "v"), ("-", "--", "-.", ":", (0, (5, 1, 1, 
 ROOM = 3
 
 
-INFLUENCES = (SEEDING, F_NUMBERS, FOCUS, WALL, INDEX, SHIFT, TURN, NOISE, DISTANCE)
 # Tracers crowd where fewer than this share is found.
 SEEN_SHARE = 0.9
 # Letters of a line above a panel.
@@ -153,14 +137,14 @@ def rows_of(found: Measured) -> tuple[Row, ...]:
     """
     rows = []
     if found.influence is NOISE:
-        spread, bound = (found.at(f"{figure}_z", FAINT) for figure in ("spread", "bound"))
+        spread, bound = (found.at(f"{figure}_z", influences.FAINT) for figure in ("spread", "bound"))
         quantity = "noise a tenth of the light: spread of depth over the Cramer-Rao bound"
-        rows = [Row(quantity=quantity, source="bound by theory", limit=LARGEST_OVER_BOUND, best=spread / bound)]
+        rows = [Row(quantity, "bound by theory", influences.LARGEST_OVER_BOUND, best=spread / bound)]
     for each in found.influence.sensitivities:
         if each.expected is not None:
             quantity = f"{found.influence.name}: {each.text}, off theory (%)"
             off, limit = 100.0 * abs(found.value(each) / each.expected - 1.0), 100.0 * each.tolerance
-            rows.append(Row(quantity=quantity, source="sensitivity by theory", limit=limit, best=off))
+            rows.append(Row(quantity, "sensitivity by theory", limit, best=off))
     return tuple(rows)
 
 
@@ -173,19 +157,19 @@ def drawing_of(found: Measured) -> Drawing:
     lines = {each.figure: each for each in influence.sensitivities if each.at is None}
     figure, both = new_panels(9.0, 3.8, 1, 2)
     for axes, panel in zip(both, influence.panels, strict=True):
-        for number, series in enumerate(panel.series):
+        for number, (figure_name, label) in enumerate(panel.series.items()):
             # medians, the range over realisations, and the straight line or the points joined
-            colour, dash, of = COLOURS[number], DASHES[number], lines.get(series.figure)
-            middle, table = series.factor * found.median(series.figure), series.factor * found.figures[series.figure]
+            colour, dash, of = COLOURS[number], DASHES[number], lines.get(figure_name)
+            middle, table = panel.factor * found.median(figure_name), panel.factor * found.figures[figure_name]
             offset, slope = (np.nan, np.nan) if of is None else found.line(of)
             style = dash if of is None or not np.isfinite(slope) else ""
-            axes.plot(found.values, middle, MARKS[number], color=colour, ls=style, ms=5, label=series.label)
+            axes.plot(found.values, middle, MARKS[number], color=colour, ls=style, ms=5, label=label)
             if table.shape[1] > 1:
                 axes.vlines(found.values, table.min(axis=1), table.max(axis=1), color=colour, lw=1.5)
             if of is not None and np.isfinite(slope):
                 known = found.values[np.isfinite(middle)]
                 x = np.linspace(known.min(), known.max(), 50)
-                axes.plot(x, series.factor * (offset + slope * x**of.power), ls=dash, color=colour, lw=1.2)
+                axes.plot(x, panel.factor * (offset + slope * x**of.power), ls=dash, color=colour, lw=1.2)
         axes.set_xlabel(influence.label, fontsize=9)
         axes.set_ylabel(panel.label, fontsize=9)
         axes.tick_params(labelsize=8)
@@ -202,8 +186,7 @@ def drawing_of(found: Measured) -> Drawing:
             axes.set_xticks(found.values, [f"{value:g}" for value in found.values])
             axes.minorticks_off()
         axes.grid(alpha=0.3)
-        shown = {series.figure for series in panel.series}
-        told = [found.told(each) for each in influence.sensitivities if each.figure in shown]
+        told = [found.told(each) for each in influence.sensitivities if each.figure in panel.series]
         axes.set_title("\n".join(textwrap.fill(each, NOTE_WIDTH) for each in told), fontsize=8, loc="left")
         if len(panel.series) > ROOM:
             axes.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.17), ncols=2)
@@ -251,9 +234,9 @@ def crowding(found: Measured) -> str:
     turned = f", and from {better[0]:g} on volumes do better" if better.size else ""
     few, many = (found.at("tracks_rms_w", value) for value in (values[0], values[-1]))
     return (
-        f"The paper seeds {PAPER_PER_PIXEL:g} tracers for each pixel, which are {PAPER_PER_LENS:.2f} for each "
-        f"microlens, over the 10 mm of its channel. There {found.at('recall', PAPER_PER_LENS):.0%} of the tracers are "
-        f"found, and a displacement in depth is wrong by {written(rms['tracks'], 2)} mm rms by particles and by "
+        f"The paper seeds {influences.PAPER_PER_PIXEL:g} tracers for each pixel, which are {PAPER_PER_LENS:.2f} for "
+        f"each microlens, over the 10 mm of its channel. There {found.at('recall', PAPER_PER_LENS):.0%} of the tracers "
+        f"are found, and a displacement in depth is wrong by {written(rms['tracks'], 2)} mm rms by particles and by "
         f"{written(rms['volumes'], 2)} mm by volumes. Of the seedings tried, fewer than {SEEN_SHARE:.0%} are found "
         f"{told}: neighbours are taken for one another, and the error of a particle's displacement in depth rises from "
         f"{written(few, 2)} mm at {values[0]:g} for each microlens to {written(many, 2)} mm at {values[-1]:g}{turned}. "

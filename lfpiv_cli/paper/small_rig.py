@@ -32,9 +32,8 @@ from lfpiv_cli.reconstruction.equations import normalisers
 from lfpiv_cli.reconstruction.solvers import SolverSettings, reconstruct
 from lfpiv_cli.reference import Reference
 from lfpiv_cli.robust import MAD_TO_SIGMA
-from lfpiv_cli.synthetic.render import Balls, render_points
+from lfpiv_cli.synthetic.render import Balls, Readout, render_points
 from lfpiv_cli.synthetic.scenes import Misalignment
-from lfpiv_cli.synthetic.sensor import Readout
 from lfpiv_cli.tracks.candidates import Seen
 from lfpiv_cli.tracks.tracking import track
 from lfpiv_cli.validation.planning import cramer_rao_bound, expected_image, pixel_variance, slopes

@@ -22,16 +22,7 @@ from lfpiv_cli.notice import written
 from lfpiv_cli.paper.parts import AS_PAPER, BOARD, Drawing, Findings, Row, Work, merged, sections
 from lfpiv_cli.paper.pictures import board_view, centres_figure, elongation_figure, location_figure, views_figure
 from lfpiv_cli.synthetic.board import dot_centres
-from lfpiv_cli.validation.board import (
-    DEPTH_DEFINITIONS,
-    DEPTHS_MM,
-    MEASURES,
-    PAPER,
-    THE_PAPERS,
-    DotFigures,
-    board_figures,
-    measure_dots,
-)
+from lfpiv_cli.validation import board as of_boards
 from lfpiv_cli.verbs.simulate import placement_of
 from lfpiv_cli.verbs.validate_board import BoardBench, BoardSolver, bench_of, board_solver
 
@@ -155,14 +146,14 @@ class _Boards:
         result = solve(self.pictures[number], advance)
         volume = bench.weights.to_world(result.volume)
         centres = dot_centres(self.board, placement_of(self.paper, depth))[:, :2]
-        dots = measure_dots(volume, bench.weights.grid, centres, 0.5 * self.board.spacing_mm)
+        dots = of_boards.measure_dots(volume, bench.weights.grid, centres, 0.5 * self.board.spacing_mm)
         view = board_view(volume, bench.weights.grid) if depth == 0.0 else None
         return {"dots": vars(dots), "view": view, "residual": float(result.residual[-1])}
 
 
 def _boards(work: Work, half: Half) -> _Boards:
     reach = REACH_MM[work.size]
-    depths = tuple(depth for depth in DEPTHS_MM if abs(depth) <= reach)
+    depths = tuple(depth for depth in of_boards.DEPTHS_MM if abs(depth) <= reach)
     return _Boards(half, depths, load_config(_config(work, half, "paper")), load_config(_config(work, half, "best")))
 
 
@@ -193,16 +184,16 @@ def table3(work: Work, half: Half) -> Findings:
                 measure = partial(boards.measure, method, number, advance)
                 steps[method].append(work.step(f"{method}_{depth:+.0f}mm", measure))
         work.console.say(f"{work.folder.name}: {METHODS[method]}, {len(steps[method])} boards")
-    dots = {method: [DotFigures.from_plain(each["dots"]) for each in steps[method]] for method in METHODS}
+    dots = {method: [of_boards.DotFigures.from_plain(each["dots"]) for each in steps[method]] for method in METHODS}
     figures = {
-        method: board_figures(each, boards.depths_mm, boards.board.dots, boards.board.spacing_mm)
+        method: of_boards.board_figures(each, boards.depths_mm, boards.board.dots, boards.board.spacing_mm)
         for method, each in dots.items()
     }
     middle = boards.depths_mm.index(0.0)
     kept = {METHODS[method]: steps[method][middle]["view"] for method in VIEWED}
     views = {told: {name: np.array(each, np.float64) for name, each in view.items()} for told, view in kept.items()}
     return Findings(
-        rows=tuple(_row(boards, measure, figures) for measure in MEASURES),
+        rows=tuple(_row(boards, measure, figures) for measure in of_boards.MEASURES),
         drawings=_drawings(boards, figures, views, dots),
         tables=(_depth_table(figures),),
         text=_text(work, boards, figures),
@@ -217,7 +208,7 @@ def _row(boards: _Boards, measure: str, figures: Figures) -> Row:
     half, spacing_mm = boards.half, boards.board.spacing_mm
     quantity, scale = QUANTITIES[measure]
     # rounded: 100 x 0.056 is not 5.6
-    paper = {method: round(scale * PAPER[half, method][measure], 9) for method in ("dlfc", "ert")}
+    paper = {method: round(scale * of_boards.PAPER[half, method][measure], 9) for method in ("dlfc", "ert")}
     ours = {method: scale * each[measure] for method, each in figures.items()}
     reason = ""
     if ours["ert"] > paper["ert"]:
@@ -232,9 +223,9 @@ def _row(boards: _Boards, measure: str, figures: Figures) -> Row:
             worst, middle = int(np.argmax(values)), f"median over the depths {written(np.median(values))} {unit}"
             reason = f"largest at z = {depth[worst]:+.0f} mm, {written(values[worst])} {unit}; {middle}"
     return Row(
-        quantity=quantity,
-        source=f"Table 3, {SOURCE[half]}",
-        limit=paper["ert"],
+        quantity,
+        f"Table 3, {SOURCE[half]}",
+        paper["ert"],
         paper_dlfc=paper["dlfc"],
         paper_ert=paper["ert"],
         **ours,
@@ -243,13 +234,13 @@ def _row(boards: _Boards, measure: str, figures: Figures) -> Row:
 
 
 def _drawings(
-    boards: _Boards, figures: Figures, views: dict[str, dict[str, Floats]], dots: dict[str, list[DotFigures]]
+    boards: _Boards, figures: Figures, views: dict[str, dict[str, Floats]], dots: dict[str, list[of_boards.DotFigures]]
 ) -> tuple[Drawing, ...]:
     half = boards.half
     named = {METHODS[method]: each for method, each in figures.items()}
     lengths, places = FIGURES[half]
     centres = {
-        METHODS[m]: np.concatenate([np.column_stack([d.lateral_mm, d.depth_mm[THE_PAPERS]]) for d in dots[m]])
+        METHODS[m]: np.concatenate([np.column_stack([d.lateral_mm, d.depth_mm[of_boards.THE_PAPERS]]) for d in dots[m]])
         for m in VIEWED
     }
     steps = PAPERS_STEPS_MM[half]
@@ -279,10 +270,10 @@ def _drawings(
 def _depth_table(figures: Figures) -> Table:
     """Return the depth error by every definition: what the paper's words leave open."""
     rows = []
-    for name, definition in DEPTH_DEFINITIONS.items():
+    for name, definition in of_boards.DEPTH_DEFINITIONS.items():
         each = {method: figures[method]["depth_definitions"][name] for method in METHODS}
         errors = (f"{100.0 * found['error']:.2f}" for found in each.values())
-        words = definition.words + (" (used)" if name == THE_PAPERS else "")
+        words = definition.words + (" (used)" if name == of_boards.THE_PAPERS else "")
         rows.append((words, *errors, f"{each['ert']['shortest']:.3f} to {each['ert']['longest']:.3f}"))
     head = ("depth of a dot", *METHODS.values(), "separations, ERT (mm)")
     return Table("Depth error (%) by what is taken for the depth of a dot", head, tuple(rows))
@@ -302,7 +293,7 @@ def _text(work: Work, boards: _Boards, figures: Figures) -> tuple[str, ...]:
     board, volume = boards.board, boards.paper.grid()
     solver, best = boards.paper.reconstruction, boards.best.reconstruction
     deepest = boards.depths_mm[-1]
-    steps, table = figures["ert"]["depth_definitions"][THE_PAPERS], figures["ert"]["by_depth"]
+    steps, table = figures["ert"]["depth_definitions"][of_boards.THE_PAPERS], figures["ert"]["by_depth"]
     middle = boards.depths_mm.index(0.0)
     lengths = np.array(table["elongation_mm"])
     return (

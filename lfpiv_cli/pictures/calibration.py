@@ -15,30 +15,15 @@ from lfpiv_cli.calibration.views import refocused_stack, views_across
 from lfpiv_cli.notice import written
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media
-from lfpiv_cli.pictures.style import (
-    AXIS_NAMES,
-    BLACK,
-    BLUE,
-    DIVERGING,
-    GREEN,
-    GREY,
-    MARKERS,
-    SEQUENTIAL,
-    SKY_BLUE,
-    VERMILION,
-    Figure,
-    new_figure,
-    new_panels,
-    styled,
-)
+from lfpiv_cli.pictures import style
 from lfpiv_cli.self_calibration.refinement import Refinement
 from lfpiv_cli.self_calibration.scene_refinement import SceneRefinement
 
-COLOURS = (GREEN, VERMILION, BLUE)
+COLOURS = (style.GREEN, style.VERMILION, style.BLUE)
 
 
-@styled
-def planning_figure(told: Mapping[str, Floats], bounds_mm: Floats) -> Figure:
+@style.styled
+def planning_figure(told: Mapping[str, Floats], bounds_mm: Floats) -> style.Figure:
     """Return errors over depth, and the volume within the field of view seen from above and from the side.
 
     Parameters
@@ -46,11 +31,11 @@ def planning_figure(told: Mapping[str, Floats], bounds_mm: Floats) -> Figure:
     told : `depth_mm` (n,), `sigma_mm` (n, 3), half the fields of view `full_view_mm` and `any_view_mm` (n, 2)
     bounds_mm : (3, 2) of the volume, z from the focal point
     """
-    figure, (errors, *views) = new_panels(9.5, 3.6, 1, 3)
+    figure, (errors, *views) = style.new_panels(9.5, 3.6, 1, 3)
     depth = told["depth_mm"]
-    for axis, name in enumerate(AXIS_NAMES):
+    for axis, name in enumerate(style.AXIS_NAMES):
         sigma_um = 1e3 * told["sigma_mm"][:, axis]
-        errors.semilogy(depth, sigma_um, color=COLOURS[axis], marker=MARKERS[axis], label=name)
+        errors.semilogy(depth, sigma_um, color=COLOURS[axis], marker=style.MARKERS[axis], label=name)
     errors.set(xlabel="z from the focal plane (mm)", ylabel="smallest error of a tracer alone (µm)")
     errors.grid(alpha=0.3, which="both")
     errors.legend()
@@ -59,9 +44,9 @@ def planning_figure(told: Mapping[str, Floats], bounds_mm: Floats) -> Figure:
             half = told[key][:, axis]
             axes.fill_between(depth, -half, half, color=str(shade), label=label)
         (left, right), (low, high) = bounds_mm[2], bounds_mm[axis]
-        axes.plot([left, right, right, left, left], [low, low, high, high, low], color=VERMILION, label="volume")
-        axes.axvline(0.0, color=GREY, linestyle=":")
-        axes.set(xlabel="z from the focal plane (mm)", ylabel=f"{AXIS_NAMES[axis]} (mm)")
+        axes.plot([left, right, right, left, left], [low, low, high, high, low], color=style.VERMILION, label="volume")
+        axes.axvline(0.0, color=style.GREY, linestyle=":")
+        axes.set(xlabel="z from the focal plane (mm)", ylabel=f"{style.AXIS_NAMES[axis]} (mm)")
     views[0].legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=3)
     return figure
 
@@ -72,8 +57,8 @@ VIEWS_PER_SIDE = 5
 STEPS = (-4.0, -2.0, 0.0, 2.0, 4.0)
 
 
-@styled
-def views_figure(calibration: Calibration, camera: Camera, media: Media, image: ArrayLike) -> Figure:
+@style.styled
+def views_figure(calibration: Calibration, camera: Camera, media: Media, image: ArrayLike) -> style.Figure:
     """Return a figure with the views of a raw picture less its dark frame, and the same refocused about the board.
 
     `camera` is the data sheet's and `media` what the picture was taken in. Needs matplotlib.
@@ -87,7 +72,7 @@ def views_figure(calibration: Calibration, camera: Camera, media: Media, image: 
 
     views = views_across(rectified, measured, VIEWS_PER_SIDE)
     brightest = max(float(view.max()) for _, view in views.values())
-    figure = new_figure(13.0, 12.5)
+    figure = style.new_figure(13.0, 12.5)
     grid = figure.add_gridspec(VIEWS_PER_SIDE + 1, len(STEPS), height_ratios=(1.0,) * VIEWS_PER_SIDE + (1.3,))
     for (row, column), (point, view) in views.items():
         axis = figure.add_subplot(grid[row, column])
@@ -107,16 +92,16 @@ def views_figure(calibration: Calibration, camera: Camera, media: Media, image: 
 LENSES_ACROSS = 6.0
 
 
-@styled
-def summary_figure(calibration: Calibration) -> Figure:
+@style.styled
+def summary_figure(calibration: Calibration) -> style.Figure:
     """Return what a calibration tells without its pictures: residuals, transmission, and the board or the rays."""
-    figure, ((along_columns, along_rows), (passed, board)) = new_panels(11.0, 8.0, 2, 2)
+    figure, ((along_columns, along_rows), (passed, board)) = style.new_panels(11.0, 8.0, 2, 2)
     for axis, direction in ((along_columns, 0), (along_rows, 1)):
         draw_residual(figure, axis, calibration.fit, direction, calibration.image_shape)
     if calibration.transmission is None:
         _draw_nothing(passed, "transmission not measured")
     else:
-        shown = passed.imshow(calibration.transmission, cmap=SEQUENTIAL, vmin=0.0, interpolation="nearest")
+        shown = passed.imshow(calibration.transmission, cmap=style.SEQUENTIAL, vmin=0.0, interpolation="nearest")
         figure.colorbar(shown, ax=passed, label="share of light passed", shrink=0.8)
         passed.set(title="transmission, upright; 0 where unusable", xlabel="column (px)", ylabel="row (px)")
     draw_board_or_rays(figure, board, calibration)
@@ -130,13 +115,13 @@ def lattice_words(fit: LatticeFit) -> str:
     return f"{fit.lenses} lenses, pitch {pitch[0]:.4f} and {pitch[1]:.4f} px, rotation {turn:z.4f} degrees"
 
 
-@styled
-def calibration_figure(calibration: Calibration, white: ArrayLike, board: ArrayLike | None = None) -> Figure:
+@style.styled
+def calibration_figure(calibration: Calibration, white: ArrayLike, board: ArrayLike | None = None) -> style.Figure:
     """Return a figure with the lattice on the white image (middle and two corners), the residuals, and the board.
 
     `white` and `board` are the raw pictures (rows, columns). Needs matplotlib.
     """
-    figure, panels = new_panels(14.0, 8.8, 2, 3)
+    figure, panels = style.new_panels(14.0, 8.8, 2, 3)
     axes = panels.ravel()
     image = np.asarray(white, dtype=np.float64)
     rows, columns = image.shape
@@ -152,8 +137,8 @@ def calibration_figure(calibration: Calibration, white: ArrayLike, board: ArrayL
     for axis, (name, centre) in zip(axes, zooms.items(), strict=False):
         model = fit.centres(fit.lattice_px.nearest(np.array(centre)) + reach)
         axis.imshow(image, cmap="gray", interpolation="nearest")
-        axis.plot(*model.T, "+", color=VERMILION, markersize=14, zorder=3, label="lattice")
-        axis.plot(*fit.centres_px.T, "o", mfc="none", color=SKY_BLUE, markersize=8, label="measured")
+        axis.plot(*model.T, "+", color=style.VERMILION, markersize=14, zorder=3, label="lattice")
+        axis.plot(*fit.centres_px.T, "o", mfc="none", color=style.SKY_BLUE, markersize=8, label="measured")
         axis.set(xlim=(centre[0] - half, centre[0] + half), ylim=(centre[1] + half, centre[1] - half))
         axis.set(title=f"white image, {name}", xlabel="column (px)", ylabel="row (px)")
     axes[0].legend(loc="upper right", framealpha=0.9)
@@ -168,7 +153,7 @@ def draw_residual(figure: Any, axis: Any, fit: LatticeFit, direction: int, shape
     """Map measured less modelled centres along the columns (0) or the rows (1)."""
     residual = (fit.centres_px - fit.centres(fit.indices))[:, direction]
     limit = max(3.0 * float(np.median(np.abs(residual))), 1e-3) if fit.lenses else 1.0
-    dots = axis.scatter(*fit.centres_px.T, c=residual, s=4, cmap=DIVERGING, vmin=-limit, vmax=limit, linewidths=0)
+    dots = axis.scatter(*fit.centres_px.T, c=residual, s=4, cmap=style.DIVERGING, vmin=-limit, vmax=limit, linewidths=0)
     figure.colorbar(dots, ax=axis, label="measured less modelled (px)", shrink=0.8)
     along = ("columns", "rows")[direction]
     rms = (fit.residual_px if fit.cubic_used else fit.residual_affine_px)[direction]
@@ -196,7 +181,7 @@ def draw_board_or_rays(figure: Any, axis: Any, calibration: Calibration, board: 
     if board is not None:
         image = np.asarray(board, dtype=np.float64)
         axis.imshow(image, cmap="gray", vmin=np.percentile(image, 1.0), vmax=np.percentile(image, 99.9))
-    dots = axis.scatter(*pose.dots_px.T, c=pose.dots_mm[:, 2], s=120, cmap=SEQUENTIAL, marker="+", linewidths=2)
+    dots = axis.scatter(*pose.dots_px.T, c=pose.dots_mm[:, 2], s=120, cmap=style.SEQUENTIAL, marker="+", linewidths=2)
     figure.colorbar(dots, ax=axis, label="depth (mm)", shrink=0.8)
     tilt = " and ".join(f"{angle:z.2f}" for angle in pose.tilt_deg)
     axis.set_title(f"board: z = {pose.z0_mm:z.3f} mm, M = {pose.magnification:.4f},\ntilt {tilt} degrees")
@@ -217,8 +202,8 @@ BARS_AT_ROUND_WALL = 60
 ZOOM_PER_RADIUS = 0.08
 
 
-@styled
-def round_wall_figure(refinement: SceneRefinement) -> Figure:
+@style.styled
+def round_wall_figure(refinement: SceneRefinement) -> style.Figure:
     """Return a figure of the particles beside the pipe's wall, in its section, by angle, along the axis, and counted.
 
     Distances are those from the axis that was told before. Needs matplotlib.
@@ -228,18 +213,18 @@ def round_wall_figure(refinement: SceneRefinement) -> Figure:
     own = scene.about_axis(refinement.position_mm, np.zeros(4))
     angle, distance = np.arctan2(own[:, 2], own[:, 1]), np.hypot(own[:, 1], own[:, 2])
     limits = radius * (1.0 - ZOOM_PER_RADIUS), radius * (1.0 + ZOOM_PER_RADIUS)
-    figure, ((section, around), (along, counted)) = new_panels(12.0, 9.0, 2, 2)
+    figure, ((section, around), (along, counted)) = style.new_panels(12.0, 9.0, 2, 2)
     fine = np.linspace(-np.pi, np.pi, 400)
     found = _wall(refinement, fine)
-    section.plot(own[:, 1], own[:, 2], ",", color=SKY_BLUE)
-    section.plot(found * np.cos(fine), found * np.sin(fine), color=VERMILION, linewidth=1.0)
-    section.plot(radius * np.cos(fine), radius * np.sin(fine), color=GREY, linestyle=":")
+    section.plot(own[:, 1], own[:, 2], ",", color=style.SKY_BLUE)
+    section.plot(found * np.cos(fine), found * np.sin(fine), color=style.VERMILION, linewidth=1.0)
+    section.plot(radius * np.cos(fine), radius * np.sin(fine), color=style.GREY, linestyle=":")
     section.set(xlabel="across (mm)", ylabel="away from the camera (mm)", aspect="equal")
     section.invert_yaxis()
     section.set_title(f"{len(own)} of {refinement.particles} particles, whose wall is in view")
-    around.plot(np.rad2deg(angle), distance, ".", color=SKY_BLUE, markersize=2.0, label="particles")
-    around.plot(np.rad2deg(fine), found, color=VERMILION, label="wall by the particles")
-    around.axhline(radius, color=GREY, linestyle=":", label="wall before")
+    around.plot(np.rad2deg(angle), distance, ".", color=style.SKY_BLUE, markersize=2.0, label="particles")
+    around.plot(np.rad2deg(fine), found, color=style.VERMILION, label="wall by the particles")
+    around.axhline(radius, color=style.GREY, linestyle=":", label="wall before")
     around.set(
         xlabel="angle about the axis, from across to away from the camera (degrees)",
         ylabel="distance from the axis before (mm)",
@@ -248,14 +233,14 @@ def round_wall_figure(refinement: SceneRefinement) -> Figure:
     )
     around.legend(loc="lower right")
     moved = distance - (_wall(refinement, angle, own[:, 0]) - wall.radius_mm)
-    along.plot(own[:, 0], moved, ".", color=SKY_BLUE, markersize=2.0)
-    along.axhline(wall.radius_mm, color=VERMILION)
-    along.axhline(radius, color=GREY, linestyle=":")
+    along.plot(own[:, 0], moved, ".", color=style.SKY_BLUE, markersize=2.0)
+    along.axhline(wall.radius_mm, color=style.VERMILION)
+    along.axhline(radius, color=style.GREY, linestyle=":")
     along.set(xlabel="place along the axis (mm)", ylabel="distance from the axis found (mm)", ylim=limits)
     edges = np.linspace(*limits, BARS_AT_ROUND_WALL + 1)
-    counted.stairs(np.histogram(moved, edges)[0], edges, fill=True, color=SKY_BLUE)
-    counted.axvline(wall.radius_mm, color=VERMILION, label=f"{wall.radius_mm:.3f} mm, found")
-    counted.axvline(radius, color=BLACK, linestyle=":", label="of the scene")
+    counted.stairs(np.histogram(moved, edges)[0], edges, fill=True, color=style.SKY_BLUE)
+    counted.axvline(wall.radius_mm, color=style.VERMILION, label=f"{wall.radius_mm:.3f} mm, found")
+    counted.axvline(radius, color=style.BLACK, linestyle=":", label="of the scene")
     counted.set(xlabel="distance from the axis found (mm)", ylabel="particles", xlim=limits)
     counted.legend(loc="upper right")
     sigma = np.sqrt(np.diag(refinement.covariance))
@@ -278,8 +263,8 @@ BARS, BARS_AT_WALL = 100, 60
 ZOOM_PER_WIDTH = 0.06
 
 
-@styled
-def walls_figure(refinement: Refinement) -> Figure:
+@style.styled
+def walls_figure(refinement: Refinement) -> style.Figure:
     """Return a figure with the depths of the particles: all, beside each wall, and across the channel.
 
     Needs matplotlib.
@@ -288,7 +273,7 @@ def walls_figure(refinement: Refinement) -> Figure:
     depth = walls.depth_from_middle(refinement.position_mm)
     half = 0.5 * walls.width_mm
     searched = refinement.depths_mm[1] - refinement.depths_mm[0]
-    figure, ((whole, across), (near, far)) = new_panels(12.0, 8.0, 2, 2)
+    figure, ((whole, across), (near, far)) = style.new_panels(12.0, 8.0, 2, 2)
     limits = (0.5 * searched * np.array([-1.0, 1.0])).tolist()
     _draw_depths(whole, refinement, depth, (limits[0], limits[1]), BARS)
     expected = (refinement.expected_z_mm or 0.0) - walls.middle_mm
@@ -302,10 +287,10 @@ def walls_figure(refinement: Refinement) -> Figure:
         _draw_depths(axes, refinement, depth, (side * half - zoom, side * half + zoom), BARS_AT_WALL)
         axes.set_title(f"{name} wall, at z = {walls.middle_mm + side * half:z.3f} mm on the axis")
     position = refinement.position_mm
-    across.plot(position[:, 0], position[:, 2], ",", color=SKY_BLUE)
+    across.plot(position[:, 0], position[:, 2], ",", color=style.SKY_BLUE)
     x = np.array([position[:, 0].min(), position[:, 0].max()])
     for end in (-0.5, 0.5):
-        across.plot(x, walls.middle_mm + end * walls.width_mm + walls.slope[0] * x, color=VERMILION)
+        across.plot(x, walls.middle_mm + end * walls.width_mm + walls.slope[0] * x, color=style.VERMILION)
     across.set(xlabel="x (mm)", ylabel="z (mm)", title="from the side, and the walls at y = 0")
     middle, sigma = walls.middle_mm, refinement.middle_sigma_mm
     tilt = " and ".join(f"{angle:z.2f}" for angle in np.rad2deg(np.arctan(walls.slope)))
@@ -315,9 +300,9 @@ def walls_figure(refinement: Refinement) -> Figure:
 
 def _draw_depths(axes: Any, refinement: Refinement, depth: Floats, limits: tuple[float, float], bars: int) -> None:
     """Draw how many particles lie at each depth behind the mid plane, and the fitted profile."""
-    axes.hist(depth, bins=bars, range=limits, color=SKY_BLUE, label="particles")
+    axes.hist(depth, bins=bars, range=limits, color=style.SKY_BLUE, label="particles")
     fine = np.linspace(*limits, 1000)
     width = (limits[1] - limits[0]) / bars
     expected = refinement.walls.density(fine, refinement.depths_mm[1] - refinement.depths_mm[0]) * len(depth) * width
-    axes.plot(fine, expected, color=VERMILION, label="fitted")
+    axes.plot(fine, expected, color=style.VERMILION, label="fitted")
     axes.set(xlabel="depth behind the mid plane, tilt taken out (mm)", ylabel="particles", xlim=limits)

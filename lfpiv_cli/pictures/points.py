@@ -18,23 +18,7 @@ from lfpiv_cli.notice import written
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.curved_space import CurvedSpace
 from lfpiv_cli.optics.media import Media, equivalent_object_distance
-from lfpiv_cli.pictures.style import (
-    AXIS_NAMES,
-    BLUE,
-    COLOURS,
-    COMPONENT_NAMES,
-    DEPTH_LABEL,
-    DIVERGING,
-    SEQUENTIAL,
-    VERMILION,
-    Figure,
-    draw_medians,
-    new_figure,
-    new_panels,
-    percentiles_by_depth,
-    slab_edges,
-    styled,
-)
+from lfpiv_cli.pictures import style
 
 # Of an image's values: the scale ends where so many (%) lie within, single hot pixels beyond it.
 IMAGE_PERCENT = 99.5
@@ -64,30 +48,31 @@ def places_px(focal_point_mm: Floats, camera: Camera, media: Media, scene: Curve
     return camera.mm_to_px(camera.image_distance_mm * slopes * camera.micro_image_scale)
 
 
-@styled
-def places_figure(position_mm: Floats, light_counts: Floats) -> Figure:
+@style.styled
+def places_figure(position_mm: Floats, light_counts: Floats) -> style.Figure:
     """Return the particles from the front and from the side, coloured by their light (logarithmic)."""
     from matplotlib.colors import LogNorm
 
     lit = light_counts > 0.0
     norm = LogNorm(*np.percentile(light_counts[lit], (2.0, 98.0))) if lit.sum() > 1 else None
-    figure, panels = new_panels(IMAGE_WIDTH, 4.6, 1, 2)
-    how: dict[str, Any] = {"s": 6, "cmap": SEQUENTIAL, "norm": norm, "linewidths": 0}
+    figure, panels = style.new_panels(IMAGE_WIDTH, 4.6, 1, 2)
+    how: dict[str, Any] = {"s": 6, "cmap": style.SEQUENTIAL, "norm": norm, "linewidths": 0}
     for axes, up in zip(panels, (1, 2), strict=True):
         dots = axes.scatter(position_mm[lit, 0], position_mm[lit, up], c=light_counts[lit], **how)
-        axes.set(xlabel="x (mm)", ylabel=f"{AXIS_NAMES[up]} (mm)", aspect="equal")
+        axes.set(xlabel="x (mm)", ylabel=f"{style.AXIS_NAMES[up]} (mm)", aspect="equal")
     figure.colorbar(dots, ax=panels.tolist(), label="light of a particle (counts)")
     figure.suptitle(f"{len(position_mm)} particles, from the front and from the side")
     return figure
 
 
-@styled
-def image_figure(image: Floats, places: Floats, z_mm: Floats) -> Figure:
+@style.styled
+def image_figure(image: Floats, places: Floats, z_mm: Floats) -> style.Figure:
     """Return a raw image in grey with the particles' places (n, 2) as (column, row), coloured by their depth."""
     figure, axes = _image_canvas(image)
     axes.imshow(image, cmap="gray", vmin=0.0, vmax=_bright(image), interpolation="nearest")
     size = float(np.clip(DOTS_AREA / max(len(z_mm), 1), *DOT_SIZES))
-    dots = axes.scatter(places[:, 0], places[:, 1], c=z_mm, s=size, cmap=SEQUENTIAL, edgecolors="white", linewidths=0.5)
+    how: dict[str, Any] = {"cmap": style.SEQUENTIAL, "edgecolors": "white", "linewidths": 0.5}
+    dots = axes.scatter(places[:, 0], places[:, 1], c=z_mm, s=size, **how)
     rows, columns = image.shape
     axes.set(xlim=(-0.5, columns - 0.5), ylim=(rows - 0.5, -0.5))
     figure.colorbar(dots, ax=axes, label="depth z (mm)", shrink=0.7)
@@ -95,21 +80,21 @@ def image_figure(image: Floats, places: Floats, z_mm: Floats) -> Figure:
     return figure
 
 
-@styled
-def residual_figure(residual: Floats) -> Figure:
+@style.styled
+def residual_figure(residual: Floats) -> style.Figure:
     """Return what the particles leave of an image: light that none explains, red, and too much light, blue."""
     figure, axes = _image_canvas(residual)
     limit = _bright(residual)
-    shown = axes.imshow(residual, cmap=DIVERGING, vmin=-limit, vmax=limit, interpolation="nearest")
+    shown = axes.imshow(residual, cmap=style.DIVERGING, vmin=-limit, vmax=limit, interpolation="nearest")
     figure.colorbar(shown, ax=axes, label="image less particles (counts)", shrink=0.7)
     axes.set_title(f"residual, rms {written(np.sqrt(np.mean(residual**2)))} counts")
     return figure
 
 
-def _image_canvas(image: Floats) -> tuple[Figure, Any]:
+def _image_canvas(image: Floats) -> tuple[style.Figure, Any]:
     """Return a figure of an image's shape, and its axes, which are the image's pixels."""
     rows, columns = image.shape
-    figure, axes = new_panels(IMAGE_WIDTH, min(max(0.8 * IMAGE_WIDTH * rows / columns + 0.8, 3.0), 12.0))
+    figure, axes = style.new_panels(IMAGE_WIDTH, min(max(0.8 * IMAGE_WIDTH * rows / columns + 0.8, 3.0), 12.0))
     axes.set(xlabel="column (px)", ylabel="row (px)")
     return figure, axes
 
@@ -120,28 +105,28 @@ def _bright(image: Floats) -> float:
     return limit if limit > 0.0 else 1.0
 
 
-@styled
-def depths_figure(z_mm: Floats, light_counts: Floats, covariance_mm2: Floats) -> Figure:
+@style.styled
+def depths_figure(z_mm: Floats, light_counts: Floats, covariance_mm2: Floats) -> style.Figure:
     """Return by depth: how many particles, their light (median and quartiles), and their standard deviations."""
-    figure = new_figure(11.0, 3.6)
+    figure = style.new_figure(11.0, 3.6)
     counts, light, sigmas = figure.subplots(1, 3)
-    counts.hist(z_mm, bins=slab_edges(z_mm), color=BLUE)
-    counts.set(xlabel=DEPTH_LABEL, ylabel="particles")
-    draw_medians(light, z_mm, {"light": light_counts}, "light of a particle (counts), median")
-    (places, low), (_, high) = (percentiles_by_depth(z_mm, light_counts, percent) for percent in (25.0, 75.0))
-    light.fill_between(places, low, high, color=BLUE, alpha=0.25, label="quartiles")
+    counts.hist(z_mm, bins=style.slab_edges(z_mm), color=style.BLUE)
+    counts.set(xlabel=style.DEPTH_LABEL, ylabel="particles")
+    style.draw_medians(light, z_mm, {"light": light_counts}, "light of a particle (counts), median")
+    (places, low), (_, high) = (style.percentiles_by_depth(z_mm, light_counts, percent) for percent in (25.0, 75.0))
+    light.fill_between(places, low, high, color=style.BLUE, alpha=0.25, label="quartiles")
     light.legend()
-    along = {f"along {name}": np.sqrt(covariance_mm2[:, k]) for k, name in enumerate(AXIS_NAMES)}
-    draw_medians(sigmas, z_mm, along, "standard deviation (mm), median")
+    along = {f"along {name}": np.sqrt(covariance_mm2[:, k]) for k, name in enumerate(style.AXIS_NAMES)}
+    style.draw_medians(sigmas, z_mm, along, "standard deviation (mm), median")
     return figure
 
 
-@styled
-def chi2_figure(chi2: Floats) -> Figure:
+@style.styled
+def chi2_figure(chi2: Floats) -> style.Figure:
     """Return chi2, about 1 where particles explain all light; what is beyond the axis is in the last bar."""
-    figure, axes = new_panels(6.0, 3.6)
-    axes.hist(np.minimum(chi2, LARGEST_CHI2), bins=CHI2_BARS, range=(0.0, LARGEST_CHI2), color=BLUE)
-    axes.axvline(1.0, color=VERMILION, linestyle="--", label="all light explained")
+    figure, axes = style.new_panels(6.0, 3.6)
+    axes.hist(np.minimum(chi2, LARGEST_CHI2), bins=CHI2_BARS, range=(0.0, LARGEST_CHI2), color=style.BLUE)
+    axes.axvline(1.0, color=style.VERMILION, linestyle="--", label="all light explained")
     beyond = int(np.count_nonzero(chi2 > LARGEST_CHI2))
     axes.set(xlabel="chi2", ylabel="particles", title=f"median {np.median(chi2):.2f}, {beyond} beyond {LARGEST_CHI2:g}")
     axes.legend()
@@ -172,8 +157,8 @@ def trajectory_lines(position_mm: Floats, track: NDArray[np.int64]) -> list[Floa
     return np.split(position_mm, np.flatnonzero(np.diff(track)) + 1) if len(track) else []
 
 
-@styled
-def space_figure(lines: list[Floats], speed_m_s: Floats, what: str) -> Figure:
+@style.styled
+def space_figure(lines: list[Floats], speed_m_s: Floats, what: str) -> style.Figure:
     """Return lines in space coloured by their speed, the depth to the right; many are thinned out evenly.
 
     Parameters
@@ -186,10 +171,10 @@ def space_figure(lines: list[Floats], speed_m_s: Floats, what: str) -> Figure:
 
     every = max(1, -(-len(lines) // LINES_DRAWN))
     chosen, speeds = lines[::every], speed_m_s[::every]
-    figure = new_figure(8.5, 6.5)
+    figure = style.new_figure(8.5, 6.5)
     axes = figure.add_subplot(projection="3d")
     # (z, x, y): the light comes from the right, y points up
-    drawn = Line3DCollection([line[:, [2, 0, 1]] for line in chosen], cmap=SEQUENTIAL, linewidths=1.0)
+    drawn = Line3DCollection([line[:, [2, 0, 1]] for line in chosen], cmap=style.SEQUENTIAL, linewidths=1.0)
     drawn.set_array(speeds)
     drawn.set_clim(0.0, float(speeds.max()) if len(speeds) else 1.0)
     axes.add_collection3d(drawn, autolim=False)
@@ -204,44 +189,44 @@ def space_figure(lines: list[Floats], speed_m_s: Floats, what: str) -> Figure:
     return figure
 
 
-@styled
-def velocities_figure(velocity_m_s: Floats) -> Figure:
+@style.styled
+def velocities_figure(velocity_m_s: Floats) -> style.Figure:
     """Return histograms of the velocity components."""
-    figure = new_figure(10.0, 3.2)
+    figure = style.new_figure(10.0, 3.2)
     for component, axes in enumerate(figure.subplots(1, 3)):
-        axes.hist(velocity_m_s[:, component], bins=HISTOGRAM_BARS, color=COLOURS[component])
-        axes.set(xlabel=f"{COMPONENT_NAMES[component]} (m/s)", ylabel="tracks")
+        axes.hist(velocity_m_s[:, component], bins=HISTOGRAM_BARS, color=style.COLOURS[component])
+        axes.set(xlabel=f"{style.COMPONENT_NAMES[component]} (m/s)", ylabel="tracks")
     return figure
 
 
-@styled
-def links_figure(link_probability: Floats) -> Figure:
+@style.styled
+def links_figure(link_probability: Floats) -> style.Figure:
     """Return how probable the links are, of those whose probability is known."""
     known = link_probability[np.isfinite(link_probability)]
-    figure, axes = new_panels(6.0, 3.6)
-    axes.hist(known, bins=PROBABILITY_BARS, range=(0.0, 1.0), color=BLUE)
+    figure, axes = style.new_panels(6.0, 3.6)
+    axes.hist(known, bins=PROBABILITY_BARS, range=(0.0, 1.0), color=style.BLUE)
     axes.set_yscale("log")
     axes.set_title(f"{known.size} links, {float(np.sum(1.0 - known)):.1f} wrong ones expected")
     axes.set(xlabel="probability that a link is right", ylabel="links", xlim=(0.0, 1.0))
     return figure
 
 
-@styled
-def sigma_figure(z_mm: Floats, sigma_m_s: Floats) -> Figure:
+@style.styled
+def sigma_figure(z_mm: Floats, sigma_m_s: Floats) -> style.Figure:
     """Return the stated standard deviations of the velocity's components by depth (medians)."""
-    figure, axes = new_panels(6.0, 3.6)
-    along = {f"σ of {name}": sigma_m_s[:, k] for k, name in enumerate(COMPONENT_NAMES)}
-    draw_medians(axes, z_mm, along, "standard deviation (m/s), median")
+    figure, axes = style.new_panels(6.0, 3.6)
+    along = {f"σ of {name}": sigma_m_s[:, k] for k, name in enumerate(style.COMPONENT_NAMES)}
+    style.draw_medians(axes, z_mm, along, "standard deviation (m/s), median")
     return figure
 
 
-@styled
-def lengths_figure(track: NDArray[np.int64]) -> Figure:
+@style.styled
+def lengths_figure(track: NDArray[np.int64]) -> style.Figure:
     """Return how many frames the trajectories span."""
     lengths = np.unique(track, return_counts=True)[1]
-    figure, axes = new_panels(6.0, 3.6)
+    figure, axes = style.new_panels(6.0, 3.6)
     most = int(lengths.max()) if lengths.size else 1
-    axes.hist(lengths, bins=(np.arange(most + 1) + 0.5).tolist(), color=BLUE, rwidth=0.9)
+    axes.hist(lengths, bins=(np.arange(most + 1) + 0.5).tolist(), color=style.BLUE, rwidth=0.9)
     axes.set(xlabel="frames in a trajectory", ylabel="trajectories", title=f"{lengths.size} trajectories")
     return figure
 

@@ -31,7 +31,7 @@ AXIS_NAMES = ("x", "y", "z")
 
 # M. Okabe and K. Ito, "Color Universal Design" (2008); their yellow is too pale for lines on white.
 BLACK, ORANGE, SKY_BLUE, GREEN = "#000000", "#E69F00", "#56B4E9", "#009E73"
-YELLOW, BLUE, VERMILION, PURPLE = "#F0E442", "#0072B2", "#D55E00", "#CC79A7"
+BLUE, VERMILION, PURPLE = "#0072B2", "#D55E00", "#CC79A7"
 COLOURS = (BLUE, ORANGE, GREEN, VERMILION, PURPLE, SKY_BLUE, BLACK)
 # As many as colours, so that curves are told apart in print too.
 MARKERS = ("o", "s", "^", "D", "v", "P", "x")

@@ -26,25 +26,7 @@ from lfpiv_cli.flow.field import (
     derived_fields,
 )
 from lfpiv_cli.grid import Grid
-from lfpiv_cli.pictures.style import (
-    AXIS_NAMES,
-    BLUE,
-    COLOURS,
-    COMPONENT_NAMES,
-    DEPTH_LABEL,
-    DIVERGING,
-    GREY,
-    MARKERS,
-    ORANGE,
-    SEQUENTIAL,
-    SKY_BLUE,
-    VERMILION,
-    Axes,
-    Figure,
-    new_panels,
-    styled,
-    symmetric_limit,
-)
+from lfpiv_cli.pictures import style
 
 # The three middle planes of what lives on a grid, side by side at one length per mm.
 #
@@ -82,17 +64,17 @@ class Plane(NamedTuple):
 PLANES = (Plane(0, 1), Plane(0, 2), Plane(1, 2))
 
 
-def plane_panels(grid: Grid, rows: int = 1) -> tuple[Figure, NDArray[Any]]:
+def plane_panels(grid: Grid, rows: int = 1) -> tuple[style.Figure, NDArray[Any]]:
     """Return a figure with rows of three panels, one for each plane, as wide as their parts of the grid."""
     sizes = [high - low for low, high in map(grid.bounds_mm, range(3))]
     widths = [sizes[plane.right] for plane in PLANES]
     tallest = ROW_WIDTH * max(sizes[plane.up] for plane in PLANES) / sum(widths)
     height = MARGIN_HEIGHT + min(max(tallest, LEAST_HEIGHT), LARGEST_HEIGHT)
-    return new_panels(ROW_WIDTH + MARGIN_WIDTH, rows * height, rows, 3, squeeze=False, width_ratios=widths)
+    return style.new_panels(ROW_WIDTH + MARGIN_WIDTH, rows * height, rows, 3, squeeze=False, width_ratios=widths)
 
 
 def draw_maps(
-    row: Sequence[Axes], grid: Grid, maps: Sequence[NDArray[Any]], titles: Sequence[str], **scale: Any
+    row: Sequence[style.Axes], grid: Grid, maps: Sequence[NDArray[Any]], titles: Sequence[str], **scale: Any
 ) -> Any:
     """Draw the middle planes of three arrays [z, y, x] (of one, given three times), or planes, as maps on one scale.
 
@@ -100,11 +82,11 @@ def draw_maps(
     blank.
     """
     for axes, plane, values, title in zip(row, PLANES, maps, titles, strict=True):
-        extent, place, right, up = plane.extent(grid), "", AXIS_NAMES[plane.right], AXIS_NAMES[plane.up]
+        extent, place, right, up = plane.extent(grid), "", style.AXIS_NAMES[plane.right], style.AXIS_NAMES[plane.up]
         if values.ndim > 2:
             values = plane.of(values)
             middle = grid.axis_mm(plane.normal)[grid.shape_xyz[plane.normal] // 2]
-            place = f"{right}-{up} at {AXIS_NAMES[plane.normal]} = {middle:z.2f} mm"
+            place = f"{right}-{up} at {style.AXIS_NAMES[plane.normal]} = {middle:z.2f} mm"
         image = axes.imshow(values, origin="lower", extent=extent, interpolation="nearest", **scale)
         axes.set(
             xlabel=f"{right} (mm)",
@@ -127,8 +109,8 @@ class MapRow:
     scale: dict[str, Any]
 
 
-@styled
-def maps_figure(grid: Grid, rows: Sequence[MapRow], shrink: float = 1.0) -> Figure:
+@style.styled
+def maps_figure(grid: Grid, rows: Sequence[MapRow], shrink: float = 1.0) -> style.Figure:
     """Return rows of maps in the three middle planes; neighbours whose colours are called alike share their bar."""
     figure, axes = plane_panels(grid, rows=len(rows))
     drawn = zip(axes, rows, strict=True)
@@ -141,7 +123,13 @@ def maps_figure(grid: Grid, rows: Sequence[MapRow], shrink: float = 1.0) -> Figu
     return figure
 
 
-FLAG_COLOURS = {VALID: BLUE, SECOND_PEAK: SKY_BLUE, REPLACED: ORANGE, REJECTED: VERMILION, MASKED: "0.85"}
+FLAG_COLOURS = {
+    VALID: style.BLUE,
+    SECOND_PEAK: style.SKY_BLUE,
+    REPLACED: style.ORANGE,
+    REJECTED: style.VERMILION,
+    MASKED: "0.85",
+}
 # More arrows than this along an axis hide each other.
 MOST_ARROWS = 32
 # Flows slower than this are told in mm/s.
@@ -177,14 +165,14 @@ def shown(field: VectorField) -> Shown:
     return Shown(values, None if sigma is None else np.where(known, sigma * scale, np.nan), unit)
 
 
-def planes_figure(field: VectorField) -> Figure:
+def planes_figure(field: VectorField) -> style.Figure:
     """Return the vectors in the three middle planes, see `compared_figure`."""
     told = shown(field)
     return compared_figure(field.grid, {"": told.values}, told.unit)
 
 
-@styled
-def compared_figure(grid: Grid, fields: Mapping[str, Floats], unit: str) -> Figure:
+@style.styled
+def compared_figure(grid: Grid, fields: Mapping[str, Floats], unit: str) -> style.Figure:
     """Return vectors (nz, ny, nx, 3) in the three middle planes, a row for each field, by its name.
 
     Arrows show the components in the plane and colour the one across it; both have one scale in all. Crosses are
@@ -193,7 +181,7 @@ def compared_figure(grid: Grid, fields: Mapping[str, Floats], unit: str) -> Figu
     figure, axes = plane_panels(grid, rows=len(fields))
     across = {name: [values[..., plane.normal] for plane in PLANES] for name, values in fields.items()}
     scale = signed_scale(*across.values())
-    longest = symmetric_limit(
+    longest = style.symmetric_limit(
         *(plane.of(values)[..., [plane.right, plane.up]] for values in fields.values() for plane in PLANES)
     )
     step = [-(-n // MOST_ARROWS) for n in grid.shape_xyz]
@@ -201,7 +189,7 @@ def compared_figure(grid: Grid, fields: Mapping[str, Floats], unit: str) -> Figu
     how: dict[str, Any] = {"angles": "xy", "scale_units": "xy", "scale": longest / (ARROW_REACH * spacing)}
     how |= {"units": "inches", "width": ARROW_WIDTH, "pivot": "mid"}
     for row, (name, values) in zip(axes, fields.items(), strict=True):
-        components = [COMPONENT_NAMES[plane.normal] for plane in PLANES]
+        components = [style.COMPONENT_NAMES[plane.normal] for plane in PLANES]
         titles = [f"{name}: {component}" if name else component for component in components]
         image = draw_maps(row, grid, across[name], titles, **scale)
         for panel, plane in zip(row, PLANES, strict=True):
@@ -209,7 +197,7 @@ def compared_figure(grid: Grid, fields: Mapping[str, Floats], unit: str) -> Figu
             of_plane = plane.of(values)[chosen]
             right, up = np.meshgrid(grid.axis_mm(plane.right)[chosen[1]], grid.axis_mm(plane.up)[chosen[0]])
             known = np.isfinite(of_plane).all(axis=-1)
-            panel.plot(right[~known], up[~known], "x", color=GREY, markersize=3)
+            panel.plot(right[~known], up[~known], "x", color=style.GREY, markersize=3)
             along, across_mm = of_plane[known, plane.right], of_plane[known, plane.up]
             arrows = panel.quiver(right[known], up[known], along, across_mm, **how)
     length = float(f"{0.7 * longest:.1g}")
@@ -222,44 +210,46 @@ def compared_figure(grid: Grid, fields: Mapping[str, Floats], unit: str) -> Figu
 def speed_unit(*velocities_m_s: Floats) -> tuple[float, str]:
     """Return the unit in which velocities read well: what m/s are multiplied by, and its name."""
     known = any(np.isfinite(each).any() for each in velocities_m_s)
-    return (1.0 / MM_TO_M, "mm/s") if known and symmetric_limit(*velocities_m_s) < SLOW_M_S else (1.0, "m/s")
+    return (1.0 / MM_TO_M, "mm/s") if known and style.symmetric_limit(*velocities_m_s) < SLOW_M_S else (1.0, "m/s")
 
 
-def components_figure(field: VectorField) -> Figure:
+def components_figure(field: VectorField) -> style.Figure:
     """Return maps of each component (rows) in the three middle planes, on one scale a component."""
     told = shown(field)
-    each = [(name, [told.values[..., component]] * 3) for component, name in enumerate(COMPONENT_NAMES)]
+    each = [(name, [told.values[..., component]] * 3) for component, name in enumerate(style.COMPONENT_NAMES)]
     rows = [MapRow(maps, [name] * 3, f"{name} ({told.unit})", signed_scale(maps)) for name, maps in each]
     return maps_figure(field.grid, rows)
 
 
 def signed_scale(*rows: Sequence[Floats]) -> dict[str, Any]:
     """Return the colours of rows of three maps with a sign, symmetric about zero: by what the middle planes show."""
-    limit = symmetric_limit(*(plane.of(values) for maps in rows for plane, values in zip(PLANES, maps, strict=True)))
-    return {"cmap": DIVERGING, "vmin": -limit, "vmax": limit}
+    limit = style.symmetric_limit(
+        *(plane.of(values) for maps in rows for plane, values in zip(PLANES, maps, strict=True))
+    )
+    return {"cmap": style.DIVERGING, "vmin": -limit, "vmax": limit}
 
 
-@styled
-def profiles_figure(field: VectorField) -> Figure:
+@style.styled
+def profiles_figure(field: VectorField) -> style.Figure:
     """Return the mean of each component (rows) over the planes across each axis (columns).
 
     The band is the standard deviation of one vector (rms over the plane) to both sides, where it is known.
     """
     told = shown(field)
-    figure, axes = new_panels(10.0, 7.5, 3, 3, sharey="row", sharex="col")
+    figure, axes = style.new_panels(10.0, 7.5, 3, 3, sharey="row", sharex="col")
     for (component, axis), panel in np.ndenumerate(axes):
         others = tuple(k for k in range(3) if k != 2 - axis)
-        places, colour = field.grid.axis_mm(axis), COLOURS[component]
+        places, colour = field.grid.axis_mm(axis), style.COLOURS[component]
         mean = mean_of_known(told.values[..., component], others)
-        panel.axhline(0.0, color=GREY, linewidth=0.8)
+        panel.axhline(0.0, color=style.GREY, linewidth=0.8)
         panel.plot(places, mean, "o-", color=colour)
         if told.sigma is not None:
             sigma = np.sqrt(mean_of_known(told.sigma[..., component] ** 2, others))
             band: dict[str, Any] = {"color": colour, "alpha": 0.25, "linewidth": 0.0}
             panel.fill_between(places, mean - sigma, mean + sigma, label="± σ of one vector", **band)
     for k in range(3):
-        axes[k, 0].set_ylabel(f"{COMPONENT_NAMES[k]} ({told.unit}), mean over the plane")
-        axes[-1, k].set_xlabel(f"{AXIS_NAMES[k]} (mm)")
+        axes[k, 0].set_ylabel(f"{style.COMPONENT_NAMES[k]} ({told.unit}), mean over the plane")
+        axes[-1, k].set_xlabel(f"{style.AXIS_NAMES[k]} (mm)")
     if told.sigma is not None:
         axes[0, 0].legend()
     return figure
@@ -274,7 +264,7 @@ def mean_of_known(values: Floats, axes: tuple[int, ...]) -> Floats:
     return mean
 
 
-def sigma_figure(field: VectorField) -> Figure:
+def sigma_figure(field: VectorField) -> style.Figure:
     """Return maps of the stated standard deviation of each component (rows), on one logarithmic scale.
 
     Outer ones take the colours of the scale's ends.
@@ -292,13 +282,15 @@ def sigma_figure(field: VectorField) -> Figure:
     low, high = np.percentile(known, SCALE_PERCENT) if known.size else (0.1, 1.0)
     if low == high:
         low, high = 0.5 * low, 2.0 * high
-    label, scale = f"stated standard deviation ({told.unit})", {"cmap": SEQUENTIAL, "norm": LogNorm(low, high)}
-    each = [([told.sigma[..., component]] * 3, [f"σ of {name}"] * 3) for component, name in enumerate(COMPONENT_NAMES)]
+    label, scale = f"stated standard deviation ({told.unit})", {"cmap": style.SEQUENTIAL, "norm": LogNorm(low, high)}
+    each = [
+        ([told.sigma[..., component]] * 3, [f"σ of {name}"] * 3) for component, name in enumerate(style.COMPONENT_NAMES)
+    ]
     return maps_figure(field.grid, [MapRow(maps, titles, label, scale) for maps, titles in each], shrink=0.6)
 
 
-@styled
-def flags_figure(field: VectorField) -> Figure:
+@style.styled
+def flags_figure(field: VectorField) -> style.Figure:
     """Return the flags in the three middle planes, with how many vectors of the whole field have each."""
     from matplotlib.colors import BoundaryNorm, ListedColormap
     from matplotlib.patches import Patch
@@ -317,15 +309,15 @@ def flags_figure(field: VectorField) -> Figure:
     return figure
 
 
-def quality_figure(field: VectorField, names: dict[str, Floats]) -> Figure:
+def quality_figure(field: VectorField, names: dict[str, Floats]) -> style.Figure:
     """Return maps of quantities [z, y, x] that tell how good vectors are (rows), each on its own scale from zero."""
-    scales = [{"vmin": 0.0, "vmax": symmetric_limit(values)} for values in names.values()]
+    scales = [{"vmin": 0.0, "vmax": style.symmetric_limit(values)} for values in names.values()]
     each = zip(names.items(), scales, strict=True)
     return maps_figure(field.grid, [MapRow([values] * 3, [""] * 3, name, scale) for (name, values), scale in each])
 
 
-@styled
-def displacements_figure(field: VectorField, lens_mm: float | None = None) -> Figure:
+@style.styled
+def displacements_figure(field: VectorField, lens_mm: float | None = None) -> style.Figure:
     """Return histograms of the displacements of valid vectors, and of what they are beyond whole voxels.
 
     Parts that crowd about zero tell of locking. Volumes lock to whole microlenses: with their width in the scene,
@@ -334,11 +326,11 @@ def displacements_figure(field: VectorField, lens_mm: float | None = None) -> Fi
     units = {"voxels": np.ones(3)}
     if lens_mm is not None:
         units["microlenses"] = lens_mm / np.asarray(field.voxel_mm)
-    figure, axes = new_panels(10.0, 2.6 * (1 + len(units)), 1 + len(units), 3)
+    figure, axes = style.new_panels(10.0, 2.6 * (1 + len(units)), 1 + len(units), 3)
     valid = field.displacement_voxel[field.flag == VALID]
     for component, column in enumerate(axes.T):
         values = valid[np.isfinite(valid[:, component]), component]
-        name, colour = COMPONENT_NAMES[component], COLOURS[component]
+        name, colour = style.COMPONENT_NAMES[component], style.COLOURS[component]
         column[0].hist(values, bins=HISTOGRAM_BARS, color=colour)
         column[0].set(xlabel=f"displacement {name} (voxel)", ylabel="valid vectors")
         for panel, (unit, size) in zip(column[1:], units.items(), strict=True):
@@ -350,7 +342,7 @@ def displacements_figure(field: VectorField, lens_mm: float | None = None) -> Fi
     return figure
 
 
-def gradients_figure(field: VectorField) -> Figure:
+def gradients_figure(field: VectorField) -> style.Figure:
     """Return the vorticity across the three middle planes, and below it the divergence, zero in a liquid, in 1/s.
 
     Raises
@@ -361,7 +353,7 @@ def gradients_figure(field: VectorField) -> Figure:
         raise ValueError("rates need a time between the frames")
     derived = derived_fields(field)
     across = [derived.vorticity[..., plane.normal] for plane in PLANES]
-    names = [f"vorticity along {AXIS_NAMES[plane.normal]}" for plane in PLANES]
+    names = [f"vorticity along {style.AXIS_NAMES[plane.normal]}" for plane in PLANES]
     # One scale for both: the divergence, which should be zero, tells how much of the vorticity is noise.
     scale = signed_scale(across, [derived.divergence] * 3)
     rows = [(across, names), ([derived.divergence] * 3, ["divergence"] * 3)]
@@ -374,10 +366,10 @@ def gradients_figure(field: VectorField) -> Figure:
 BRIGHT_PERCENT = 99.8
 
 
-@styled
+@style.styled
 def column_figure(
     pixels: tuple[NDArray[np.int64], NDArray[np.int64]], weights: NDArray[np.float32], pixel_mm: float, title: str
-) -> Figure:
+) -> style.Figure:
     """Return one voxel's column as the sensor would see it, against pixels' numbers and mm on the sensor.
 
     Parameters
@@ -388,7 +380,7 @@ def column_figure(
     picture = np.zeros((int(np.ptp(rows)) + 1, int(np.ptp(columns)) + 1))
     picture[rows - rows.min(), columns - columns.min()] = weights
     left, right, top, bottom = columns.min() - 0.5, columns.max() + 0.5, rows.min() - 0.5, rows.max() + 0.5
-    figure, axis = new_panels(6.8, 6.0)
+    figure, axis = style.new_panels(6.8, 6.0)
     image = axis.imshow(picture, cmap="gray", extent=(left, right, bottom, top), interpolation="nearest")
     figure.colorbar(image, ax=axis, label="weight (share of the voxel's light)", location="bottom", shrink=0.8)
     axis.set(xlabel="column (px)", ylabel="row (px)")
@@ -404,35 +396,35 @@ def _to_mm(first_px: float, pixel_mm: float) -> tuple[Callable[[Any], Any], Call
     return lambda px: (px - first_px) * pixel_mm, lambda mm: mm / pixel_mm + first_px
 
 
-@styled
-def light_figure(z_mm: Floats, sums: Mapping[str, Floats]) -> Figure:
+@style.styled
+def light_figure(z_mm: Floats, sums: Mapping[str, Floats]) -> style.Figure:
     """Return by depth how much of a voxel's light meets the sensor, for voxels at some lateral places."""
-    figure, axes = new_panels(6.5, 3.8)
-    for (name, values), colour, marker in zip(sums.items(), COLOURS, MARKERS, strict=False):
+    figure, axes = style.new_panels(6.5, 3.8)
+    for (name, values), colour, marker in zip(sums.items(), style.COLOURS, style.MARKERS, strict=False):
         axes.plot(z_mm, values, f"{marker}-", color=colour, markerfacecolor="none", label=name)
     highest = max((float(values.max()) for values in sums.values()), default=1.0)
-    axes.set(xlabel=DEPTH_LABEL, ylabel="sum of a voxel's weights (1)", ylim=(0.0, 1.05 * highest or 1.0))
+    axes.set(xlabel=style.DEPTH_LABEL, ylabel="sum of a voxel's weights (1)", ylim=(0.0, 1.05 * highest or 1.0))
     axes.legend()
     return figure
 
 
-@styled
-def projections_figure(volume: NDArray[np.float32], grid: Grid) -> Figure:
+@style.styled
+def projections_figure(volume: NDArray[np.float32], grid: Grid) -> style.Figure:
     """Return the brightest voxel along each line of sight in the three directions, on one scale."""
     figure, axes = plane_panels(grid)
     # Along an axis that a plane is across, nothing is left but the plane.
     seen = [volume.max(axis=2 - plane.normal) for plane in PLANES]
     limit = float(np.percentile(np.concatenate([each.ravel() for each in seen]), BRIGHT_PERCENT)) or 1.0
-    titles = [f"largest along {AXIS_NAMES[plane.normal]}" for plane in PLANES]
+    titles = [f"largest along {style.AXIS_NAMES[plane.normal]}" for plane in PLANES]
     image = draw_maps(axes[0], grid, seen, titles, cmap="inferno", vmin=0.0, vmax=limit)
     figure.colorbar(image, ax=axes[0].tolist(), label="intensity (1)", shrink=0.75, extend="max")
     return figure
 
 
-@styled
-def depths_figure(volume: NDArray[np.float32], grid: Grid) -> Figure:
+@style.styled
+def depths_figure(volume: NDArray[np.float32], grid: Grid) -> style.Figure:
     """Return the mean intensity of each plane by depth."""
-    figure, axes = new_panels(6.0, 3.6)
+    figure, axes = style.new_panels(6.0, 3.6)
     axes.plot(grid.axis_mm(2), volume.mean(axis=(1, 2), dtype=np.float64))
-    axes.set(xlabel=DEPTH_LABEL, ylabel="mean intensity of the plane (1)", ylim=(0.0, None))
+    axes.set(xlabel=style.DEPTH_LABEL, ylabel="mean intensity of the plane (1)", ylim=(0.0, None))
     return figure

@@ -261,59 +261,35 @@ def taylor_green(
     lies along the third axis.
     """
     first, second = ("xyz".index(axis) for axis in plane)
-    wave = 2.0 * np.pi / wavelength_mm
-    if third_amplitude_m_s is not None:
-        amplitudes = np.empty(3)
-        amplitudes[first], amplitudes[second] = amplitude_m_s, -(amplitude_m_s + third_amplitude_m_s)
-        amplitudes[3 - first - second] = third_amplitude_m_s
-        return _placed(*_cellular(amplitudes, wave), centre_mm, velocity_m_s)
-
-    def phases(relative_mm: Floats) -> tuple[Floats, Floats]:
-        return wave * relative_mm[:, first], wave * relative_mm[:, second]
+    third, wave = 3 - first - second, 2.0 * np.pi / wavelength_mm
+    # amplitudes add up to nothing; plane vortices do not change along the third axis
+    amplitudes, waves = np.zeros(3), np.full(3, wave)
+    if third_amplitude_m_s is None:
+        waves[third] = 0.0
+    else:
+        amplitudes[third] = third_amplitude_m_s
+    amplitudes[first], amplitudes[second] = amplitude_m_s, -(amplitude_m_s + amplitudes[third])
 
     def flow(relative_mm: Floats) -> Floats:
-        a, b = phases(relative_mm)
-        velocity = np.zeros((len(relative_mm), 3))
-        velocity[:, first] = amplitude_m_s * np.sin(a) * np.cos(b)
-        velocity[:, second] = -amplitude_m_s * np.cos(a) * np.sin(b)
-        return velocity
+        sine, cosine = np.sin(waves * relative_mm), np.cos(waves * relative_mm)
+        others = np.stack([np.prod(np.delete(cosine, i, axis=1), axis=1) for i in range(3)], axis=1)
+        return np.asarray(amplitudes * sine * others)
 
     def gradient(relative_mm: Floats) -> Floats:
-        a, b = phases(relative_mm)
-        found = np.zeros((len(relative_mm), 3, 3))
-        rate = MM_PER_M * wave * amplitude_m_s
-        found[:, first, first] = rate * np.cos(a) * np.cos(b)
-        found[:, second, second] = -found[:, first, first]
-        found[:, second, first] = rate * np.sin(a) * np.sin(b)
-        found[:, first, second] = -found[:, second, first]
-        return found
+        sine, cosine = np.sin(waves * relative_mm), np.cos(waves * relative_mm)
+        found = np.empty((len(relative_mm), 3, 3))
+        for i, j in np.ndindex(3, 3):
+            beside = cosine[:, 3 - i - j] if i != j else np.prod(cosine, axis=1)
+            found[:, i, j] = waves[j] * (beside if i == j else -sine[:, i] * sine[:, j] * beside)
+        return MM_PER_M * amplitudes[:, np.newaxis] * found
 
     def pressure(relative_mm: Floats, density_kg_m3: float) -> Floats:
-        a, b = phases(relative_mm)
+        a, b = wave * relative_mm[:, first], wave * relative_mm[:, second]
         return 0.25 * density_kg_m3 * amplitude_m_s**2 * (np.cos(2.0 * a) + np.cos(2.0 * b))
 
     at_rest = velocity_m_s[first] == 0.0 and velocity_m_s[second] == 0.0
-    return _placed(flow, gradient, centre_mm, velocity_m_s, pressure if at_rest else None)
-
-
-def _cellular(amplitudes_m_s: Floats, wave: float) -> tuple[Flow, Flow]:
-    """Return three-dimensional Taylor-Green vortices, whose three amplitudes add up to nothing, and their gradient."""
-
-    def flow(relative_mm: Floats) -> Floats:
-        sine, cosine = np.sin(wave * relative_mm), np.cos(wave * relative_mm)
-        others = np.stack([np.prod(np.delete(cosine, i, axis=1), axis=1) for i in range(3)], axis=1)
-        return np.asarray(amplitudes_m_s * sine * others)
-
-    def gradient(relative_mm: Floats) -> Floats:
-        sine, cosine = np.sin(wave * relative_mm), np.cos(wave * relative_mm)
-        found = np.empty((len(relative_mm), 3, 3))
-        for i in range(3):
-            for j in range(3):
-                third = cosine[:, 3 - i - j] if i != j else np.prod(cosine, axis=1)
-                found[:, i, j] = third if i == j else -sine[:, i] * sine[:, j] * third
-        return MM_PER_M * wave * amplitudes_m_s[:, np.newaxis] * found
-
-    return flow, gradient
+    closed = third_amplitude_m_s is None and at_rest
+    return _placed(flow, gradient, centre_mm, velocity_m_s, pressure if closed else None)
 
 
 def abc(

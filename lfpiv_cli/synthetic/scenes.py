@@ -25,8 +25,7 @@ from lfpiv_cli.optics.waves import Waves
 from lfpiv_cli.synthetic.board import BoardPlacement, dot_centres, light_per_area, render_board, sunflower
 from lfpiv_cli.synthetic.flows import MM_PER_M, STEADY, Flow, Pulsation, advect
 from lfpiv_cli.synthetic.rays import passed_light
-from lfpiv_cli.synthetic.render import RAYS, Balls, Space, render_points, render_white
-from lfpiv_cli.synthetic.sensor import Readout
+from lfpiv_cli.synthetic.render import RAYS, Balls, Readout, Space, render_points, render_white
 
 Triple = tuple[float, float, float]
 

@@ -12,37 +12,30 @@ import numpy as np
 from lfpiv_cli.arrays import Floats
 from lfpiv_cli.flow.field import VectorField
 from lfpiv_cli.flow.windows import RoundWall
-from lfpiv_cli.pictures.style import (
-    AXIS_NAMES,
-    BLACK,
-    COLOURS,
-    COMPONENT_NAMES,
-    GREY,
-    MARKERS,
-    Figure,
-    new_panels,
-    styled,
-    symmetric_limit,
-)
+from lfpiv_cli.pictures import style
 from lfpiv_cli.pictures.vectors import MapRow, compared_figure, maps_figure, mean_of_known, signed_scale, speed_unit
 from lfpiv_cli.validation.flow import INNER, PAPER_SLICES, TOLERANCE, Duct, Measured, cumulative_distribution, table_4
 
 
-@styled
-def radius_figure(fields: Mapping[str, VectorField], pipe: RoundWall, mean_velocity_m_s: float) -> Figure:
+@style.styled
+def radius_figure(fields: Mapping[str, VectorField], pipe: RoundWall, mean_velocity_m_s: float) -> style.Figure:
     """Return each component of vectors over their distance from the axis, beside Poiseuille's parabola."""
-    figure, panels = new_panels(11.0, 4.0, 1, 3)
+    figure, panels = style.new_panels(11.0, 4.0, 1, 3)
     radius = np.linspace(0.0, pipe.radius_mm, 101)
     for component, panel in enumerate(panels):
-        for (name, field), colour, marker in zip(fields.items(), cycle(COLOURS), cycle(MARKERS), strict=False):
+        for (name, field), colour, marker in zip(
+            fields.items(), cycle(style.COLOURS), cycle(style.MARKERS), strict=False
+        ):
             distance = pipe.distances_mm(field.grid.centres_mm())
             seen = np.isfinite(field.velocity[..., component]) & (distance < pipe.radius_mm)
             values = field.velocity[seen][:, component]
             panel.plot(distance[seen], values, marker, color=colour, markersize=2.0, label=name)
         axial = 2.0 * mean_velocity_m_s * (1.0 - (radius / pipe.radius_mm) ** 2)
-        panel.plot(radius, axial if component == pipe.along else 0.0 * radius, color=BLACK, label="true, analytic")
-        panel.axvline(INNER * pipe.radius_mm, color=GREY, linewidth=0.8)
-        panel.set(xlabel="distance from the axis (mm)", ylabel=f"{COMPONENT_NAMES[component]} (m/s)")
+        panel.plot(
+            radius, axial if component == pipe.along else 0.0 * radius, color=style.BLACK, label="true, analytic"
+        )
+        panel.axvline(INNER * pipe.radius_mm, color=style.GREY, linewidth=0.8)
+        panel.set(xlabel="distance from the axis (mm)", ylabel=f"{style.COMPONENT_NAMES[component]} (m/s)")
     figure.axes[0].legend()
     return figure
 
@@ -102,7 +95,7 @@ TITLE_WIDTH = 60
 LINE_POINTS = 101
 
 
-def flow_figure(methods: Mapping[str, Measured]) -> Figure:
+def flow_figure(methods: Mapping[str, Measured]) -> style.Figure:
     """Return the true vectors and those of each method, at least one, in three middle planes on one scale.
 
     The fields have one grid; what is not judged is left out.
@@ -114,34 +107,34 @@ def flow_figure(methods: Mapping[str, Measured]) -> Figure:
     return compared_figure(first.field.grid, rows, unit)
 
 
-def errors_figure(methods: Mapping[str, Measured]) -> Figure:
+def errors_figure(methods: Mapping[str, Measured]) -> style.Figure:
     """Return measured less true velocities in three middle planes: rows of methods, on one scale a component."""
     errors = {name: m.judged(m.field.velocity - m.truth) for name, m in methods.items()}
     factor, unit = speed_unit(*errors.values())
     rows = []
-    for component, letter in enumerate(COMPONENT_NAMES):
+    for component, letter in enumerate(style.COMPONENT_NAMES):
         maps = {name: [factor * error[..., component]] * 3 for name, error in errors.items()}
         label, scale = f"{letter}, measured less true ({unit})", signed_scale(*maps.values())
         rows += [MapRow(each, [f"{name}: error of {letter}"] * 3, label, scale) for name, each in maps.items()]
     return maps_figure(next(iter(methods.values())).field.grid, rows)
 
 
-@styled
-def profiles_figure(methods: Mapping[str, Measured]) -> Figure:
+@style.styled
+def profiles_figure(methods: Mapping[str, Measured]) -> style.Figure:
     """Return means of each component over the planes across each axis, and how many vectors err by how much.
 
     Means are over the windows that all methods have found; the true ones over the same.
     """
     first = next(iter(methods.values()))
     factor, unit = speed_unit(first.judged(first.truth))
-    figure, axes = new_panels(11.0, 11.0, 4, 3, sharey="row")
+    figure, axes = style.new_panels(11.0, 11.0, 4, 3, sharey="row")
     grid, found_by_all = first.field.grid, np.all([m.found for m in methods.values()], axis=0)
     curves = {"true, at the windows": first.truth} | {name: m.field.velocity for name, m in methods.items()}
-    styles = list(zip((BLACK, *COLOURS), ("+", *MARKERS), strict=True))
-    least = LEAST_RANGE * factor * symmetric_limit(first.judged(first.truth))
+    styles = list(zip((style.BLACK, *style.COLOURS), ("+", *style.MARKERS), strict=True))
+    least = LEAST_RANGE * factor * style.symmetric_limit(first.judged(first.truth))
     for component, row in enumerate(axes[:3]):
         for axis, panel in enumerate(row):
-            panel.axhline(0.0, color=GREY, linewidth=0.8)
+            panel.axhline(0.0, color=style.GREY, linewidth=0.8)
             if first.flow is not None:
                 # on planes across the axis, at the lateral places of the windows
                 places = np.linspace(*grid.bounds_mm(axis), LINE_POINTS)
@@ -149,53 +142,53 @@ def profiles_figure(methods: Mapping[str, Measured]) -> Figure:
                 points = np.tile(lateral, (places.size, 1))
                 on_planes = first.flow(np.insert(points, axis, np.repeat(places, len(lateral)), axis=1))
                 true = on_planes.reshape(places.size, len(lateral), 3)[..., component].mean(axis=1)
-                panel.plot(places, factor * true, color=BLACK, label="true, analytic")
+                panel.plot(places, factor * true, color=style.BLACK, label="true, analytic")
             for (label, values), (colour, marker) in zip(curves.items(), styles, strict=False):
                 known = np.where(found_by_all, values[..., component], np.nan)
                 mean = mean_of_known(known, tuple(k for k in range(3) if k != 2 - axis))
                 look = {"color": colour, "markerfacecolor": "none", "label": label}
                 panel.plot(grid.axis_mm(axis), factor * mean, marker, **look)
-            panel.set_xlabel(f"{AXIS_NAMES[axis]} (mm)")
-            panel.set_ylabel(f"{COMPONENT_NAMES[component]} ({unit}), mean over the plane")
+            panel.set_xlabel(f"{style.AXIS_NAMES[axis]} (mm)")
+            panel.set_ylabel(f"{style.COMPONENT_NAMES[component]} ({unit}), mean over the plane")
         low, high = row[0].get_ylim()
         row[0].set_ylim(min(low, -least), max(high, least))
     shares = {name: cumulative_distribution(m.pairs) for name, m in methods.items()}
     told = {"streamwise_share": "along the mean flow", "vector_share": "of the whole vector"}
     for panel, (key, what) in zip(axes[3], told.items(), strict=False):
-        for (name, found), colour in zip(shares.items(), cycle(COLOURS), strict=False):
+        for (name, found), colour in zip(shares.items(), cycle(style.COLOURS), strict=False):
             if found[key] is not None:
                 panel.plot(found["relative_error"], found[key], color=colour, label=name)
-        panel.axvline(TOLERANCE, color=GREY, linewidth=0.8)
+        panel.axvline(TOLERANCE, color=style.GREY, linewidth=0.8)
         panel.set(xlabel=f"relative error {what}", ylabel="share of the vectors", xlim=(0.0, 1.0), ylim=(0.0, 1.01))
     axes[3, 2].set_axis_off()
     axes[3, 2].legend(*axes[0, 0].get_legend_handles_labels(), loc="center", title="in all pictures")
     return figure
 
 
-@styled
-def slices_figure(methods: Mapping[str, Measured], duct: Duct) -> Figure:
+@style.styled
+def slices_figure(methods: Mapping[str, Measured], duct: Duct) -> style.Figure:
     """Return streamwise profiles across six slices of a duct, those of the paper's Fig. 16, and their errors.
 
     Profiles are means along the flow, over the planes of windows on both sides of a slice. The paper's errors (Table 4)
     stand beside ours only where the duct is the paper's.
     """
-    figure, axes = new_panels(12.0, 7.0, 2, 3)
+    figure, axes = style.new_panels(12.0, 7.0, 2, 3)
     first = next(iter(methods.values()))
     curves = {"true, at the windows": first.judged(first.truth)} if first.flow is None else {}
     curves |= {name: m.judged(m.field.velocity) for name, m in methods.items()}
     tables = {name: table_4(m, duct) for name, m in methods.items()}
-    main = AXIS_NAMES.index(duct.axis)
+    main = style.AXIS_NAMES.index(duct.axis)
     for row, (name, axis) in zip(axes, duct.across.items(), strict=True):
         for panel, share in zip(row, PAPER_SLICES[name], strict=True):
             position, other = duct.position_mm(axis, share), 3 - axis - main
-            panel.axhline(0.0, color=GREY, linewidth=0.8)
+            panel.axhline(0.0, color=style.GREY, linewidth=0.8)
             if first.flow is not None:
                 # as far as the walls
                 places = np.linspace(duct.position_mm(other, 0.0), duct.position_mm(other, 1.0), LINE_POINTS)
                 points = np.tile(duct.centre_mm, (LINE_POINTS, 1))
                 points[:, axis], points[:, other] = position, places
-                panel.plot(places, first.flow(points)[:, main], color=BLACK, label="true, analytic")
-            for (label, values), colour, marker in zip(curves.items(), COLOURS, MARKERS, strict=False):
+                panel.plot(places, first.flow(points)[:, main], color=style.BLACK, label="true, analytic")
+            for (label, values), colour, marker in zip(curves.items(), style.COLOURS, style.MARKERS, strict=False):
                 profile = profile_at(values[..., main], first.field.grid.axis_mm(axis), position, axis, main)
                 look = {"color": colour, "markerfacecolor": "none", "label": label}
                 panel.plot(first.field.grid.axis_mm(other), profile, marker, **look)
@@ -206,7 +199,7 @@ def slices_figure(methods: Mapping[str, Measured], duct: Duct) -> Figure:
             paper = next(iter(rows.values()))["paper_ert_percent"]
             beside = f" (paper {paper:.2f} %)" if duct.is_the_papers else ""
             panel.set_title(f"{name} = {share}{beside}\n{told}")
-            panel.set(xlabel=f"{AXIS_NAMES[other]} (mm)", ylabel=f"{COMPONENT_NAMES[main]} (m/s)")
+            panel.set(xlabel=f"{style.AXIS_NAMES[other]} (mm)", ylabel=f"{style.COMPONENT_NAMES[main]} (m/s)")
     axes[0, 0].legend()
     return figure
 

@@ -22,7 +22,7 @@ from lfpiv_cli.optics.media import Media, equivalent_object_distance
 from lfpiv_cli.particles.least_squares import lit_by, respond_all, room_for
 from lfpiv_cli.particles.view import Light, View, entry_capacity, raw_view
 from lfpiv_cli.reconstruction.solvers import SolverSettings, reconstruct
-from lfpiv_cli.synthetic.sensor import Readout
+from lfpiv_cli.synthetic.render import Readout
 from lfpiv_cli.weights.build import default_padding, factorise
 
 # What is looked at: the middle of an image, so many microlenses wide.

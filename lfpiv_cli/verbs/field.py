@@ -14,9 +14,9 @@ from lfpiv_cli.console import CONSOLE, Console
 from lfpiv_cli.errors import InputError, UsageError
 from lfpiv_cli.fields import pressure
 from lfpiv_cli.fields.fit import SEED, Field, fit_field
-from lfpiv_cli.fields.samples import Samples
 from lfpiv_cli.fields.spline_field import SplineField
 from lfpiv_cli.fields.stencils import Lattice
+from lfpiv_cli.fields.structure import Samples
 from lfpiv_cli.files import vtkhdf
 from lfpiv_cli.files.atomic import ensure_writable, write_text
 from lfpiv_cli.files.config import Config

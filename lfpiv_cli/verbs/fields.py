@@ -13,15 +13,17 @@ from numpy.typing import NDArray
 from lfpiv_cli.arrays import Floats
 from lfpiv_cli.console import Console, Frames
 from lfpiv_cli.errors import InputError, UsageError
-from lfpiv_cli.fields import fit, turbulence
-from lfpiv_cli.fields.samples import Samples, joined
+from lfpiv_cli.fields import fit
 from lfpiv_cli.fields.spline_field import SplineField, gradient_covariance_at
+from lfpiv_cli.fields.structure import Samples, joined
 from lfpiv_cli.files import vtkhdf
 from lfpiv_cli.files.batch import Target
 from lfpiv_cli.files.config import Config, carried_config
 from lfpiv_cli.files.hdf5 import format_of
 from lfpiv_cli.files.particle_file import TRACKS_FORMAT, TRAJECTORIES_FORMAT, Points, matrices, read_tracks
 from lfpiv_cli.files.provenance import OF_COORDINATES, ensure_agreement, record
+from lfpiv_cli.flow import field as vector_field
+from lfpiv_cli.flow.combining import Paths, WindowGrid, vectors_from_paths, without_tracks
 from lfpiv_cli.flow.correlation import SMALLEST_VALID_FRACTION
 from lfpiv_cli.flow.field import (
     MASKED,
@@ -34,7 +36,6 @@ from lfpiv_cli.flow.field import (
     derived_from,
     statistics_of,
 )
-from lfpiv_cli.flow.from_tracks import Paths, WindowGrid, vectors_from_paths, without_tracks
 from lfpiv_cli.flow.windows import ParallelWalls
 from lfpiv_cli.names import Divergence
 from lfpiv_cli.notice import Notice
@@ -106,15 +107,15 @@ class FittedField:
         known = vectors.flag < REJECTED
         if not known.any() or vectors.uncertainty_voxel is None:
             return {}
-        about = turbulence.fluctuations(vectors.velocity, (0, 1, 2))
+        about = vector_field.fluctuations(vectors.velocity, (0, 1, 2))
         sigma = vectors.uncertainty_voxel * np.asarray(vectors.voxel_mm) * (MM_TO_M / self.dt_s)
-        stresses = turbulence.reynolds_stresses(about, sigma**2)
+        stresses = vector_field.reynolds_stresses(about, sigma**2)
         told = {
             "reynolds_stresses_m2_s2": stresses.tolist(),
-            "kinetic_energy_m2_s2": turbulence.kinetic_energy(stresses),
+            "kinetic_energy_m2_s2": vector_field.kinetic_energy(stresses),
         }
-        if known.all() and min(known.shape) >= turbulence.FEWEST_PLANES:
-            found = turbulence.spectrum(about, self.windows.centres.spacing_mm)
+        if known.all() and min(known.shape) >= vector_field.FEWEST_PLANES:
+            found = vector_field.spectrum(about, self.windows.centres.spacing_mm)
             told |= {
                 "spectrum_wavenumber_rad_m": found.wavenumber.tolist(),
                 "spectrum_energy_m3_s2": found.energy.tolist(),
@@ -123,7 +124,7 @@ class FittedField:
             nodes = self.windows.centres.centres_mm()[known]
             covariance = gradient_covariance_at(self.field, nodes) / self.dt_s**2
             # as many parts of the volume as the splines have knots in it are independent
-            lost = turbulence.dissipation(
+            lost = vector_field.dissipation(
                 self.gradient(nodes), covariance, viscosity_m2_s, float(np.prod(self.field.lattice.cells))
             )
             told |= {"dissipation_m2_s3": lost.rate, "dissipation_m2_s3_sigma": lost.sigma}

@@ -28,7 +28,7 @@ from lfpiv_cli.optics.media import Media
 from lfpiv_cli.reference import Reference
 from lfpiv_cli.scale import Scale
 from lfpiv_cli.synthetic.flows import MM_PER_M
-from lfpiv_cli.synthetic.sensor import Readout
+from lfpiv_cli.synthetic.render import Readout
 from lfpiv_cli.validation import planning
 from lfpiv_cli.validation.planning import Miniature, Tracer
 from lfpiv_cli.verbs.build_weights import ray_source

@@ -37,9 +37,8 @@ from lfpiv_cli.synthetic import scenes
 from lfpiv_cli.synthetic.board import BoardPlacement, points_of
 from lfpiv_cli.synthetic.flows import STEADY, Pulsation
 from lfpiv_cli.synthetic.rays import objective_of, unseen
-from lfpiv_cli.synthetic.render import RAYS, Space
+from lfpiv_cli.synthetic.render import RAYS, Readout, Space
 from lfpiv_cli.synthetic.scenes import Bubbles, bubbles_at_wall, render_bubbles, seeded_boxes
-from lfpiv_cli.synthetic.sensor import Readout
 from lfpiv_cli.verbs.weights_cost import LONG_S, MUCH_BYTES
 from lfpiv_cli.weights.build import blur_radius_mm
 from lfpiv_cli.weights.scene import spread_mm

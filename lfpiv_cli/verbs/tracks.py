@@ -14,8 +14,8 @@ from lfpiv_cli.errors import InputError, UsageError
 from lfpiv_cli.files.config import Config, carried_config
 from lfpiv_cli.files.particle_file import POSITION, TRACKS_FORMAT, TRAJECTORIES_FORMAT, PointRows, Points
 from lfpiv_cli.files.provenance import OF_FRAMES, ensure_agreement, even_step_s, record, seconds_between
+from lfpiv_cli.flow.combining import Paths, WindowGrid, vectors_from_paths
 from lfpiv_cli.flow.field import MM_TO_M, VectorField
-from lfpiv_cli.flow.from_tracks import Paths, WindowGrid, vectors_from_paths
 from lfpiv_cli.flow.windows import Walls
 from lfpiv_cli.notice import warn_of
 from lfpiv_cli.reference import Reference
