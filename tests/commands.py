@@ -1,4 +1,4 @@
-"""Commands run in this process, and what they are run on: the shipped sample, or Table 2's camera with a small sensor."""
+"""Commands run in this process, and what they are run on: the sample, or Table 2's camera with a small sensor."""
 
 import json
 from pathlib import Path
@@ -10,7 +10,11 @@ import yaml
 from lfpiv_cli.cli.main import cli
 
 ROOT = Path(__file__).parent.parent
+
+
 SAMPLE, CONFIG = ROOT / "sample_data", ROOT / "configs" / "sample.yaml"
+
+
 # Of the sample's text: with it no calibration is needed.
 AT_FOCUS = ("reference: mid_plane", "reference: focal_point")
 

@@ -1,9 +1,9 @@
-"""Fixtures shared by all tests: cameras in both lattice kinds, media with and without a window, the data folder."""
+"""Fixtures shared by all tests: cameras in both lattice kinds, media, weights and frames of the sample, the data."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -11,9 +11,18 @@ from pathlib import Path
 import numba
 import numpy as np
 import pytest
+import tifffile
+from numpy.typing import NDArray
 
+from lfpiv_cli.files.config import load_config
+from lfpiv_cli.files.images import read_image
+from lfpiv_cli.files.provenance import record
+from lfpiv_cli.files.vtkhdf import write_volume
+from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.camera import Camera, Lattice
 from lfpiv_cli.optics.media import Media, Window
+from lfpiv_cli.reference import Reference
+from tests.commands import CONFIG, SAMPLE, sample_weights
 
 TABLE2 = Camera(
     magnification=-1.0,
@@ -66,20 +75,62 @@ def rng() -> np.random.Generator:
     return np.random.default_rng(20260101)
 
 
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    threads = numba.get_num_threads()
-    numba.set_num_threads(1)
-    try:
-        yield
-    finally:
-        numba.set_num_threads(threads)
-
-
 @pytest.fixture
 def one_thread() -> Callable[[], AbstractContextManager[None]]:
     """A context in which kernels run on one thread, for the bits that must not depend on their number."""
-    return _one_thread
+
+    @contextmanager
+    def alone():
+        threads = numba.get_num_threads()
+        numba.set_num_threads(1)
+        try:
+            yield
+        finally:
+            numba.set_num_threads(threads)
+
+    return alone
+
+
+@pytest.fixture(scope="session")
+def weights(tmp_path_factory: pytest.TempPathFactory):
+    """Weights of a small part of the sample's volume; their config lies beside them as `rig.yaml`."""
+    small = ("shape_xyz: [30, 22, 40]", "shape_xyz: [8, 6, 12]"), ("iterations: 16", "iterations: 2")
+    return sample_weights(tmp_path_factory.mktemp("weights"), *small)
+
+
+@pytest.fixture(scope="session")
+def raw():
+    return read_image(SAMPLE / "pair_a.tif").astype(np.uint16)
+
+
+@pytest.fixture
+def images(tmp_path: Path, raw: NDArray[np.uint16]):
+    """Three frames of the sample, each a little brighter than the one before."""
+    paths = [tmp_path / f"f{number}.tif" for number in range(3)]
+    for number, path in enumerate(paths):
+        tifffile.imwrite(path, raw + np.uint16(number), compression="zlib")
+    return paths
+
+
+@pytest.fixture(scope="session")
+def pairs(tmp_path_factory: pytest.TempPathFactory):
+    """Two pairs of small volumes."""
+    folder, rng = tmp_path_factory.mktemp("pairs"), np.random.default_rng(5)
+    made = {"provenance": record("test", load_config(CONFIG).resolved(), {}), "attributes": {}, "overwrite": False}
+    grid = Grid.centred((12, 12, 12), (0.1,) * 3, (0.0,) * 3)
+    paths = [folder / f"{name}.vtkhdf" for name in ("a0", "b0", "a1", "b1")]
+    for path in paths:
+        write_volume(path, rng.random((12, 12, 12)).astype(np.float32), grid, Reference("mid_plane", 0.0), **made)
+    return paths
+
+
+@pytest.fixture(scope="session")
+def in_process():
+    """The address of a scheduler with two workers in this process."""
+    distributed = pytest.importorskip("distributed")
+    local = {"n_workers": 2, "threads_per_worker": 1, "processes": False, "dashboard_address": None}
+    with distributed.LocalCluster(**local) as cluster:
+        yield cluster.scheduler_address
 
 
 @pytest.fixture(scope="session")

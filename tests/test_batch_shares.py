@@ -3,40 +3,19 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+import shlex
 from pathlib import Path
 
 import numpy as np
 import pytest
 import tifffile
 
-from lfpiv_cli.cli.main import cli
 from lfpiv_cli.errors import InputError, PartialError, StoppedEarlyError, UsageError
 from lfpiv_cli.files import listing
 from lfpiv_cli.files.images import read_image
 from lfpiv_cli.files.shares import Deadline
+from tests.commands import SAMPLE, run
 from tests.test_particle_stage import write_frame
-
-ROOT = Path(__file__).parent.parent
-SAMPLE = ROOT / "sample_data"
-SMALL = {"shape_xyz: [30, 22, 40]": "shape_xyz: [8, 6, 12]", "reference: mid_plane": "reference: focal_point"}
-
-
-def run(*arguments: object) -> None:
-    cli.main([str(argument) for argument in arguments], standalone_mode=False)
-
-
-@pytest.fixture(scope="module")
-def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Weights of a small part of the sample's volume."""
-    folder = tmp_path_factory.mktemp("weights")
-    text = (ROOT / "configs" / "sample.yaml").read_text()
-    for old, new in SMALL.items():
-        assert old in text
-        text = text.replace(old, new)
-    (folder / "rig.yaml").write_text(text)
-    run("build-weights", folder / "rig.yaml", "-o", folder / "weights.h5")
-    return folder / "weights.h5"
 
 
 @pytest.fixture(scope="module")
@@ -56,16 +35,6 @@ def volumes(weights: Path, frames: list[Path], tmp_path_factory: pytest.TempPath
     folder = tmp_path_factory.mktemp("volumes") / "volumes"
     reconstruct(weights, frames, folder)
     return sorted(folder.iterdir())
-
-
-@pytest.fixture
-def in_process() -> Iterator[str]:
-    """The address of a scheduler with two workers in this process."""
-    distributed = pytest.importorskip("distributed")
-    with distributed.LocalCluster(
-        n_workers=2, threads_per_worker=1, processes=False, dashboard_address=None
-    ) as cluster:
-        yield cluster.scheduler_address
 
 
 def reconstruct(weights: Path, frames: list[Path], output: Path, *options: object) -> None:
@@ -102,16 +71,25 @@ def test_the_share_of_an_array_job_is_made(
     assert sorted(bytes_of(tmp_path / "v")) == ["1.vtkhdf", "2.vtkhdf"]
 
 
-def test_more_shards_than_frames(weights: Path, frames: list[Path], tmp_path: Path) -> None:
+def test_more_shards_than_frames_and_no_time_at_all(weights: Path, frames: list[Path], tmp_path: Path) -> None:
     for number in range(1, 5):
         reconstruct(weights, frames[:2], tmp_path / "v", "--shard", f"{number}/4")
     assert len(bytes_of(tmp_path / "v")) == 2
+    # A time limit that is over at once.
+    with pytest.raises(StoppedEarlyError, match="0 of 5 frames are done"):
+        reconstruct(weights, frames, tmp_path / "w", "--time-limit", "0.000001s")
 
 
 @pytest.mark.thorough
 def test_workers_give_what_one_command_gives(
-    weights: Path, frames: list[Path], volumes: list[Path], in_process: str, tmp_path: Path, capsys
+    weights: Path,
+    frames: list[Path],
+    volumes: list[Path],
+    in_process: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
+    capsys.readouterr()
     reconstruct(weights, frames, tmp_path / "v", "--dask", in_process, "--json", "--log", tmp_path / "log")
     assert bytes_of(tmp_path / "v") == bytes_of(volumes)
     assert json.loads(capsys.readouterr().out)["reconstructed"] == 5
@@ -173,11 +151,6 @@ def test_a_batch_stops_before_its_time_limit_and_goes_on(
     assert bytes_of(tmp_path / "v") == bytes_of(volumes)
 
 
-def test_a_time_limit_that_is_over_at_once(weights: Path, frames: list[Path], tmp_path: Path) -> None:
-    with pytest.raises(StoppedEarlyError, match="0 of 5 frames are done"):
-        reconstruct(weights, frames, tmp_path / "v", "--time-limit", "0.000001s")
-
-
 class Filling:
     """A clock with which files come into a folder, each at its time, the first half of it a second before."""
 
@@ -205,7 +178,11 @@ def alone(weights: Path, frames: list[Path], output: Path, *options: object) -> 
 
 @pytest.mark.thorough
 def test_frames_of_a_folder_that_is_being_filled(
-    weights: Path, frames: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys
+    weights: Path,
+    frames: list[Path],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     camera = Filling(tmp_path / "run", {1.0: frames[0], 2.0: frames[1], 14.0: frames[2]})
     monkeypatch.setattr(listing, "time", camera)
@@ -242,7 +219,7 @@ def test_pairs_of_a_folder_that_is_being_filled(
 
 @pytest.mark.thorough
 def test_a_lost_frame_of_a_folder_that_is_being_filled_is_told_at_once(
-    volumes: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys
+    volumes: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     named = [tmp_path / f"{name}.vtkhdf" for name in ("1a", "1b", "2a", "3a", "3b")]
     for path, volume in zip(named, volumes, strict=True):
@@ -255,61 +232,49 @@ def test_a_lost_frame_of_a_folder_that_is_being_filled_is_told_at_once(
     assert capsys.readouterr().err.count("2a.vtkhdf: the second frame of its pair is missing") == 1
 
 
-def test_a_frame_that_stays_alone_in_a_folder_is_told(
-    volumes: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_what_does_not_come_is_told(
+    volumes: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, weights: Path
 ) -> None:
     folder = Filling(tmp_path / "volumes", {1.0: volumes[0]})
     monkeypatch.setattr(listing, "time", folder)
     with pytest.raises(InputError, match="no other frame has come"):
         run("correlate", folder.folder, "--pairing", "ab", "--watch", "--idle-s", 5, "-o", tmp_path / "v")
-
-
-@pytest.mark.parametrize(
-    ("options", "told"),
-    [
-        (("--background", "minimum:3"), "--background minimum:3 is made from all frames"),
-        (("--mask", "still"), "--mask still is made from all frames"),
-        (("--solver", "particles"), "the tracers' size, which --solver particles needs"),
-        (("--shard", "1/2"), "leave out --shard"),
-        (("--dry-run",), "leave out one of them"),
-    ],
-)
-def test_what_needs_all_frames_does_not_go_with_a_folder_that_is_being_filled(
-    weights: Path, tmp_path: Path, options: tuple[str, ...], told: str
-) -> None:
-    with pytest.raises(UsageError, match=told):
-        alone(weights, [tmp_path], tmp_path / "v", "--watch", *options)
-
-
-def test_a_mean_needs_all_pairs_and_a_folder_is_needed(weights: Path, volumes: list[Path], tmp_path: Path) -> None:
-    for options in (("--mean", tmp_path / "mean.vtkhdf"), ("--ensemble",)):
-        with pytest.raises(UsageError, match=f"--watch: {options[0]} is made from all pairs"):
-            run("correlate", tmp_path, "--pairing", "ab", "--watch", *options, "-o", tmp_path / "v")
-    with pytest.raises(UsageError, match="--watch takes folders"):
-        alone(weights, volumes[:1], tmp_path / "v", "--watch")
-
-
-def test_nothing_comes(weights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     camera = Filling(tmp_path / "run", {})
     monkeypatch.setattr(listing, "time", camera)
     with pytest.raises(InputError, match="no images have come in 5 s"):
         alone(weights, [camera.folder], tmp_path / "v", "--watch", "--idle-s", 5)
 
 
+ALONE, PAIRED = "reconstruct {weights} {folder}", "correlate {folder} --pairing ab"
+
+
 @pytest.mark.parametrize(
-    "options",
+    ("words", "said"),
     [
-        ("--solver", "particles"),
-        ("--solver", "particles", "--pairing", "ab"),
-        ("--solver", "particles", "--background", "minimum:5"),
+        (f"{ALONE} --background minimum:3", "--background minimum:3 is made from all frames"),
+        (f"{ALONE} --mask still", "--mask still is made from all frames"),
+        (f"{ALONE} --solver particles", "the tracers' size, which --solver particles needs"),
+        (f"{ALONE} --shard 1/2", "leave out --shard"),
+        (f"{ALONE} --dry-run", "leave out one of them"),
+        (f"{PAIRED} --mean mean.vtkhdf", "--watch: --mean is made from all pairs"),
+        (f"{PAIRED} --ensemble", "--watch: --ensemble is made from all pairs"),
+        ("reconstruct {weights} {file}", "--watch takes folders"),
     ],
-    ids=["alone", "pairs", "background"],
 )
+def test_what_does_not_go_with_a_folder_that_is_being_filled(
+    weights: Path, frames: list[Path], tmp_path: Path, words: str, said: str
+) -> None:
+    command = words.format(weights=weights, folder=tmp_path, file=frames[0])
+    with pytest.raises(UsageError, match=said):
+        run(*shlex.split(command), "--watch", "-o", tmp_path / "v")
+
+
 @pytest.mark.slow
+@pytest.mark.parametrize("options", [(), ("--pairing", "ab"), ("--background", "minimum:5")])
 def test_particles_of_shards_are_those_of_one_command(
     weights: Path, frames: list[Path], options: tuple[str, ...], tmp_path: Path
 ) -> None:
     for share in ("1/1", "2/3", "1/3", "3/3"):
-        folder = tmp_path / ("one" if share == "1/1" else "shards")
-        run("reconstruct", weights, *frames[:4], *options, "--shard", share, "--quiet", "-o", folder)
+        folder, common = tmp_path / ("one" if share == "1/1" else "shards"), ("--solver", "particles", "--quiet")
+        run("reconstruct", weights, *frames[:4], *common, *options, "--shard", share, "-o", folder)
     assert bytes_of(tmp_path / "shards") == bytes_of(tmp_path / "one")

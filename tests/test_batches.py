@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import json
 import os
+import shlex
 import socket
 import subprocess
 import sys
 import threading
 import time
 from pathlib import Path
-from typing import Any
 
 import click
 import h5py
@@ -18,15 +18,11 @@ import numpy as np
 import pytest
 import tifffile
 
-from lfpiv_cli.cli.main import cli
 from lfpiv_cli.cli.options import Terminated
 from lfpiv_cli.errors import InputError, OutputError, OutputExistsError, PartialError, UsageError
 from lfpiv_cli.files import atomic, shares
 from lfpiv_cli.files.atomic import ignores_case
-from lfpiv_cli.files.config import load_config
-from lfpiv_cli.files.images import read_image
 from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, read_points
-from lfpiv_cli.files.provenance import record
 from lfpiv_cli.files.shares import DEAD_AFTER_S, claim_path, claimed
 from lfpiv_cli.files.vtkhdf import open_volume, write_volume
 from lfpiv_cli.grid import Grid
@@ -34,25 +30,9 @@ from lfpiv_cli.reference import Reference
 from lfpiv_cli.verbs import reconstruct as stage
 from lfpiv_cli.verbs.batches import Worked
 from lfpiv_cli.verbs.tracers import TracerSize
+from tests.commands import CONFIG, ROOT, SAMPLE, run, sample_weights, told
 
-ROOT = Path(__file__).parent.parent
-SAMPLE, CONFIG = ROOT / "sample_data", ROOT / "configs" / "sample.yaml"
 QUICK = ("--iterations", 1, "--dark", SAMPLE / "dark.tif")
-
-
-def run(*arguments: object) -> None:
-    cli.main([str(argument) for argument in arguments], standalone_mode=False)
-
-
-def told(capsys: pytest.CaptureFixture[str], *arguments: object) -> dict[str, Any]:
-    """Run a command; return its summary."""
-    capsys.readouterr()
-    try:
-        run(*arguments, "--json")
-    finally:
-        out = capsys.readouterr().out
-    summary: dict[str, Any] = json.loads(out)
-    return summary
 
 
 def stamps(folder: Path) -> dict[str, tuple[int, bytes]]:
@@ -60,43 +40,15 @@ def stamps(folder: Path) -> dict[str, tuple[int, bytes]]:
     return {path.name: (path.stat().st_mtime_ns, path.read_bytes()) for path in folder.iterdir()}
 
 
-@pytest.fixture(scope="module")
-def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Weights of a few voxels of the sample's volume, without a calibration."""
-    folder = tmp_path_factory.mktemp("weights")
-    text = CONFIG.read_text().replace("shape_xyz: [30, 22, 40]", "shape_xyz: [6, 5, 4]")
-    (folder / "rig.yaml").write_text(text.replace("reference: mid_plane", "reference: focal_point"))
-    run("build-weights", folder / "rig.yaml", "-o", folder / "weights.h5")
-    return folder / "weights.h5"
-
-
-@pytest.fixture(scope="module")
-def raw() -> np.ndarray:
-    return read_image(SAMPLE / "pair_a.tif").astype(np.uint16)
-
-
-@pytest.fixture
-def images(tmp_path: Path, raw: np.ndarray) -> list[Path]:
-    """Three frames, each a little brighter than the one before."""
-    paths = [tmp_path / f"f{number}.tif" for number in range(3)]
-    for number, path in enumerate(paths):
-        tifffile.imwrite(path, raw + np.uint16(number), compression="zlib")
-    return paths
-
-
 def spoil(path: Path, kind: str) -> None:
     """Make a frame that cannot be read."""
     content = path.read_bytes()
     if kind == "missing":
         path.unlink()
-    elif kind == "empty":
-        path.write_bytes(b"")
-    elif kind == "cut":
-        path.write_bytes(content[: len(content) // 2])
     elif kind == "size":
         tifffile.imwrite(path, np.ones((20, 30), np.uint16))
     else:
-        path.write_bytes(b"no image at all")
+        path.write_bytes({"empty": b"", "cut": content[: len(content) // 2], "no image": b"no image at all"}[kind])
 
 
 @pytest.mark.thorough
@@ -109,34 +61,31 @@ def test_a_finished_batch_is_skipped_and_stays_as_it_is(weights, images, tmp_pat
         run(*command)
     again = told(capsys, *command, "--resume")
     assert (again["reconstructed"], again["skipped"]) == (0, 3)
+    with pytest.raises(OutputExistsError, match="other inputs or settings"):
+        run(*command, "--resume", "--iterations", 3)
     assert stamps(tmp_path / "out") == before
 
 
-def damage(path: Path, part: str) -> None:
-    """Damage a volume: its first bytes, its record, its data, or its end."""
-    content = bytearray(path.read_bytes())
-    with h5py.File(path) as file:
-        data = file["intensity"].id.get_chunk_info(0).byte_offset
-    at = {"head": 9, "record": content.index(b'"command"'), "data": data}.get(part)
-    if at is None:
-        del content[-100:]
-    else:
-        content[at] ^= 0x10
-    path.write_bytes(content)
-
-
 @pytest.mark.thorough
-@pytest.mark.parametrize("part", ["head", "record", "data", "end"])
-def test_a_damaged_result_is_made_anew(weights, images, tmp_path, capsys, part) -> None:
+def test_a_damaged_result_is_made_anew(weights, images, tmp_path, capsys) -> None:
     command = ("reconstruct", weights, *images[:2], *QUICK, "-o", tmp_path / "out")
     run(*command)
-    before = stamps(tmp_path / "out")
-    damage(tmp_path / "out" / "f1.vtkhdf", part)
-    summary = told(capsys, *command, "--resume")
-    assert (summary["reconstructed"], summary["skipped"]) == (1, 1)
-    after = stamps(tmp_path / "out")
-    assert after["f0.vtkhdf"] == before["f0.vtkhdf"]
-    assert after["f1.vtkhdf"][1] == before["f1.vtkhdf"][1]
+    before, damaged = stamps(tmp_path / "out"), tmp_path / "out" / "f1.vtkhdf"
+    with h5py.File(damaged) as file:
+        data = file["intensity"].id.get_chunk_info(0).byte_offset
+    # Its first bytes, its record, its data, and its end.
+    for at in (9, before["f1.vtkhdf"][1].index(b'"command"'), data, None):
+        content = bytearray(before["f1.vtkhdf"][1])
+        if at is None:
+            del content[-100:]
+        else:
+            content[at] ^= 0x10
+        damaged.write_bytes(content)
+        summary = told(capsys, *command, "--resume")
+        assert (summary["reconstructed"], summary["skipped"]) == (1, 1)
+        after = stamps(tmp_path / "out")
+        assert after["f0.vtkhdf"] == before["f0.vtkhdf"]
+        assert after["f1.vtkhdf"][1] == before["f1.vtkhdf"][1]
 
 
 @pytest.mark.parametrize("whose", ["ours", "another program's"])
@@ -212,19 +161,6 @@ def test_a_bad_frame_is_left_out_of_the_background_of_others(weights, images, ra
         np.testing.assert_array_equal(found.array, expected.array)
 
 
-@pytest.fixture(scope="module")
-def pairs(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
-    """Two pairs of small volumes."""
-    folder, rng = tmp_path_factory.mktemp("pairs"), np.random.default_rng(5)
-    made_by = record("test", load_config(CONFIG).resolved(), {})
-    grid = Grid.centred((12, 12, 12), (0.1,) * 3, (0.0,) * 3)
-    paths = [folder / f"{name}.vtkhdf" for name in ("a0", "b0", "a1", "b1")]
-    for path in paths:
-        array = rng.random((12, 12, 12)).astype(np.float32)
-        write_volume(path, array, grid, Reference("mid_plane", 0.0), provenance=made_by, attributes={}, overwrite=False)
-    return paths
-
-
 @pytest.mark.thorough
 def test_a_finished_mean_is_kept(pairs, tmp_path, capsys) -> None:
     mean = tmp_path / "mean.vtkhdf"
@@ -298,13 +234,25 @@ def test_the_claim_of_a_dead_worker_is_taken_over(weights, images, tmp_path, cap
     assert not claims_in(tmp_path)
 
 
-def test_the_claim_of_a_living_worker_is_respected(tmp_path) -> None:
+def test_a_living_worker_is_respected_and_shows_that_it_is_alive(tmp_path, monkeypatch) -> None:
     claim = claim_path(tmp_path / "f0.vtkhdf")
     for host, process in ((socket.gethostname(), os.getpid()), ("another", 1)):
         claim.write_text(json.dumps({"host": host, "process": process}))
         with claimed(tmp_path / "f0.vtkhdf") as granted:
             assert not granted
         assert claim.exists()
+    # A worker shows that it is alive.
+    monkeypatch.setattr(shares, "TOUCHED_EVERY_S", 0.01)
+    with claimed(tmp_path / "x.vtkhdf") as granted:
+        assert granted
+        claim = claim_path(tmp_path / "x.vtkhdf")
+        os.utime(claim, (0, 0))
+        for _ in range(500):
+            if claim.stat().st_mtime > 0:
+                break
+            time.sleep(0.01)
+        assert claim.stat().st_mtime > 0
+    assert not claim.exists()
 
 
 @pytest.mark.thorough
@@ -320,78 +268,44 @@ def test_no_claim_stays(weights, images, tmp_path, monkeypatch, end) -> None:
     assert not (tmp_path / "out").exists()
 
 
-def test_a_worker_shows_that_it_is_alive(tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr(shares, "TOUCHED_EVERY_S", 0.01)
-    with claimed(tmp_path / "x.vtkhdf") as granted:
-        assert granted
-        claim = claim_path(tmp_path / "x.vtkhdf")
-        os.utime(claim, (0, 0))
-        for _ in range(500):
-            if claim.stat().st_mtime > 0:
-                break
-            time.sleep(0.01)
-        assert claim.stat().st_mtime > 0
-    assert not claim.exists()
+MEAN = "correlate {pairs[0]} {pairs[1]} {pairs[2]} {pairs[3]} --pairing ab -o out"
+STILLS = f"calibrate-snapshot '{CONFIG}' --white '{SAMPLE}/white.tif' --dark '{SAMPLE}/dark.tif' -o c.h5"
 
 
-@pytest.mark.parametrize("case", ["stems", "page", "input", "failures", "log", "case"])
-def test_outputs_of_one_name_are_refused_before_any_work(weights, images, raw, tmp_path, monkeypatch, case) -> None:
-    out = tmp_path / "out"
-    out.mkdir()
-    first, options, target = images[0], [], out
-    (tmp_path / "other").mkdir()
-    second = tmp_path / "other" / {"stems": "f0.tif", "page": "run_0001.tif"}.get(case, "F0.tif")
-    second.write_bytes(first.read_bytes())
-    if case == "page":
-        first = tmp_path / "run.tif"
-        tifffile.imwrite(first, np.stack([raw] * 2), photometric="minisblack")
-    elif case == "input":
-        target = tmp_path
-        first = first.rename(tmp_path / "F0.vtkhdf")
-    elif case in ("failures", "log"):
-        options = [f"--{case}", out / "f0.vtkhdf"]
-    elif case == "case":
-        monkeypatch.setattr(atomic, "ignores_case", lambda folder: True)
-    with pytest.raises(UsageError, match="would give the same output|two outputs of this command|is also an input"):
-        run("reconstruct", weights, first, second, *QUICK, *options, "-o", target, "--overwrite")
-    assert list(out.glob("*.vtkhdf")) in ([], [out / "f0.vtkhdf"])
-
-
-def test_a_mean_and_residuals_meet_nothing(weights, images, pairs, tmp_path) -> None:
-    for mean in (tmp_path / "out" / "a0.vtkhdf", pairs[0]):
-        with pytest.raises(UsageError, match="two outputs of this command|is also an input"):
-            run("correlate", *pairs, "--pairing", "ab", "--mean", mean, "-o", tmp_path / "out", "--overwrite")
-    images[1] = images[1].rename(tmp_path / "f0_residual.tif")
-    with pytest.raises(UsageError, match="is also an input"):
-        run("reconstruct", weights, *images, *QUICK, "--solver", "particles", "-o", tmp_path, "--overwrite")
-    assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.parametrize("options", [("--picture", "c.h5"), ("--picture", "x.png", "--views", "x.png")])
-def test_pictures_of_a_calibration_have_names_of_their_own(tmp_path, monkeypatch, options) -> None:
+# Commands two of whose files are one: names that differ by their folder, a page, case; inputs, lists, logs, pictures.
+@pytest.mark.parametrize(
+    "words",
+    [
+        "reconstruct {weights} f0.tif other/f0.tif -o out",
+        "reconstruct {weights} run.tif other/run_0001.tif -o out",
+        "reconstruct {weights} f0.tif other/F0.tif -o out",
+        "reconstruct {weights} f0.vtkhdf -o .",
+        "reconstruct {weights} f0.tif f0_residual.tif --solver particles -o .",
+        "reconstruct {weights} f0.tif other/F0.tif -o out --failures out/f0.vtkhdf",
+        "reconstruct {weights} f0.tif other/F0.tif -o out --log out/f0.vtkhdf",
+        f"{MEAN} --mean out/a0.vtkhdf",
+        f"{MEAN} --mean {{pairs[0]}}",
+        "correlate {pairs[0]} {pairs[1]} -o out --log ./out",
+        f"{STILLS} --picture c.h5",
+        f"{STILLS} --picture x.png --views x.png",
+        f"refine-calibration '{CONFIG}' f0.tif --calibration z.h5 --picture c.h5 -o c.h5",
+    ],
+)
+def test_outputs_of_one_name_are_refused_before_any_work(
+    weights, images, raw, pairs, tmp_path, monkeypatch, words
+) -> None:
     monkeypatch.chdir(tmp_path)
-    stills = ("--white", SAMPLE / "white.tif", "--dark", SAMPLE / "dark.tif")
-    with pytest.raises(UsageError, match="two outputs of this command"):
-        run("calibrate-snapshot", CONFIG, *stills, *options, "-o", "c.h5", "--overwrite")
-    with pytest.raises(UsageError, match="two outputs of this command"):
-        run(
-            "refine-calibration",
-            CONFIG,
-            SAMPLE / "pair_a.tif",
-            "--calibration",
-            "z.h5",
-            "--picture",
-            "c.h5",
-            "-o",
-            "c.h5",
-        )
-
-
-def test_a_log_lies_beside_all_other_files(pairs, tmp_path) -> None:
-    output = tmp_path / "v.vtkhdf"
-    with pytest.raises(UsageError, match=r"v.vtkhdf: is the log, and another file of this command, too"):
-        run("correlate", *pairs[:2], "-o", output, "--log", tmp_path / "." / "v.vtkhdf", "--overwrite")
-    assert not output.exists()
+    Path("other").mkdir()
+    for name in ("other/f0.tif", "other/F0.tif", "other/run_0001.tif", "f0.vtkhdf", "f0_residual.tif"):
+        Path(name).write_bytes(images[0].read_bytes())
+    tifffile.imwrite("run.tif", np.stack([raw] * 2), photometric="minisblack")
+    if "log" not in words and "failures" not in words:
+        monkeypatch.setattr(atomic, "ignores_case", lambda folder: True)
+    refused = "would give the same output|two outputs of this command|is also an input|is the log, and another file"
+    with pytest.raises(UsageError, match=refused):
+        run(*shlex.split(words.format(weights=weights, pairs=pairs)), "--overwrite")
+    log = {Path("out/f0.vtkhdf")} if "log" in words else set()
+    assert {*Path().glob("out/*.vtkhdf"), *Path().glob("c.h5")} <= log
 
 
 def test_a_folder_tells_whether_it_minds_case(tmp_path, monkeypatch) -> None:
@@ -406,9 +320,7 @@ def test_a_folder_tells_whether_it_minds_case(tmp_path, monkeypatch) -> None:
 
 @pytest.mark.slow
 def test_a_pair_with_a_bad_frame_stays_as_it_is(tmp_path, capsys) -> None:
-    text = CONFIG.read_text().replace("shape_xyz: [30, 22, 40]", "shape_xyz: [16, 12, 20]")
-    (tmp_path / "rig.yaml").write_text(text.replace("reference: mid_plane", "reference: focal_point"))
-    run("build-weights", tmp_path / "rig.yaml", "-o", tmp_path / "weights.h5")
+    sample_weights(tmp_path, ("shape_xyz: [30, 22, 40]", "shape_xyz: [16, 12, 20]"))
     images = [tmp_path / f"pair_{name}.tif" for name in "ab"]
     for image in images:
         image.write_bytes((SAMPLE / image.name).read_bytes())
@@ -464,19 +376,15 @@ def test_two_workers_share_a_folder_and_a_killed_one_is_replaced(weights, raw, t
     assert [path.name for path in (tmp_path / "stopped").iterdir() if path.name.startswith(".")] == []
 
 
-def test_frames_are_searched_by_pairs_however_they_are_given(weights, images, tmp_path) -> None:
+def test_frames_are_searched_by_pairs_and_whoever_makes_one_tells_the_tracers_size(weights, images, tmp_path) -> None:
+    # However frames are given; and the command itself has not begun: workers have.
     given = [
-        path.rename(tmp_path / name) for path, name in zip(images, ("p0_a.tif", "p1_a.tif", "p0_b.tif"), strict=True)
+        image.rename(tmp_path / name) for image, name in zip(images, ("0_a.tif", "1_a.tif", "0_b.tif"), strict=True)
     ]
-    given.append(tmp_path / "p1_b.tif")
+    given.append(tmp_path / "1_b.tif")
     given[-1].write_bytes(given[0].read_bytes())
-    options = stage.ReconstructOptions(solver="particles", pairing="ab")
-    assert stage.Reconstruction(weights, given, tmp_path / "out", options, False).order == [0, 2, 1, 3]
-
-
-def test_whoever_makes_a_frame_tells_the_size_of_the_tracers(weights, images, tmp_path) -> None:
-    # The command itself has not begun: workers have.
-    batch = stage.Reconstruction(weights, images, tmp_path / "out", stage.ReconstructOptions(solver="particles"), False)
-    size = TracerSize(0.02, 0.03, 0.001)
+    options, size = stage.ReconstructOptions(solver="particles", pairing="ab"), TracerSize(0.02, 0.03, 0.001)
+    batch = stage.Reconstruction(weights, given, tmp_path / "out", options, False)
+    assert batch.order == [0, 2, 1, 3]
     told = batch.summary(Worked({0: stage.Outcome(0.1, 0, 5, size)}))
     assert told == told | size.summary()

@@ -1,4 +1,4 @@
-"""The camera of Table 2: its lengths, its pixels and its axes, by hand."""
+"""The camera of Table 2, by hand: its lengths, pixels and axes; and the lattice of its lenses, by brute force."""
 
 from __future__ import annotations
 
@@ -7,50 +7,37 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lfpiv_cli.optics.camera import Lattice
+from lfpiv_cli.optics.camera import Lattice, nearest_point
 
 
-def test_table2_lengths(table2):
+def test_table2_lengths_and_defocus(table2):
     # S_i = F_m (1 - M) = 200, F_m (M - 1)/M = 200 at M = -1; at M = -0.5: 150 and 300
     assert (table2.image_distance_mm, table2.focus_distance_mm) == (200.0, 200.0)
+    for magnification in (-0.5, -1.0, -3.0):
+        camera = replace(table2, magnification=magnification)
+        assert camera.defocus(camera.focus_distance_mm) == pytest.approx(0.0, abs=1e-14)
     half = replace(table2, magnification=-0.5)
     assert (half.image_distance_mm, half.focus_distance_mm) == (150.0, 300.0)
-
-
-@pytest.mark.parametrize("magnification", [-0.5, -1.0, -3.0])
-def test_focal_point_has_no_defocus(table2, magnification):
-    camera = replace(table2, magnification=magnification)
-    assert camera.defocus(camera.focus_distance_mm) == pytest.approx(0.0, abs=1e-14)
-
-
-def test_defocus_by_hand(table2):
     # alpha = 1 + 200/190 - 200/100 = 0.0526316: nearer than the focal point spreads with X
     assert table2.defocus(190.0) == pytest.approx(0.0526316, abs=1e-7)
 
 
-def test_micro_image_pitch_is_not_the_array_s(table2, camera):
+def test_micro_image_pitch_is_not_the_array_s(camera):
     # 0.1 mm * (1 + 0.8/200)/0.0055 mm = 18.254545 px
-    assert table2.micro_image_lattice_px().pitch == pytest.approx([18.2545, 18.2545], abs=1e-4)
     assert camera.micro_image_lattice_px().pitch == pytest.approx([18.2545, 18.2545], abs=1e-4)
-
-
-def test_axis_meets_the_sensor_between_the_middle_pixels(table2):
-    assert table2.sensor_centre_px == pytest.approx([1175.5, 883.5])
-    assert table2.mm_to_px((0.0, 0.0)) == pytest.approx([1175.5, 883.5])
-    # pixel 1176 is centred half a pixel, 0.00275 mm, along +x of the axis
-    assert table2.px_to_mm((1176, 883)) == pytest.approx([0.00275, -0.00275])
-
-
-def test_px_and_mm_invert(table2, rng):
-    px = rng.uniform(0, 2000, (20, 2))
-    assert table2.mm_to_px(table2.px_to_mm(px)) == pytest.approx(px)
-
-
-def test_with_micro_images_inverts_micro_image_lattice(camera):
     moved = Lattice.regular(18.3, camera.lattice.layout, 0.01, (1180.0, 880.0))
     found = camera.with_micro_images(moved).micro_image_lattice_px()
     assert found.origin == pytest.approx(moved.origin)
     assert found.basis == pytest.approx(moved.basis)
+
+
+def test_axis_meets_the_sensor_between_the_middle_pixels(table2, rng):
+    assert table2.sensor_centre_px == pytest.approx([1175.5, 883.5])
+    assert table2.mm_to_px((0.0, 0.0)) == pytest.approx([1175.5, 883.5])
+    # pixel 1176 is centred half a pixel, 0.00275 mm, along +x of the axis
+    assert table2.px_to_mm((1176, 883)) == pytest.approx([0.00275, -0.00275])
+    px = rng.uniform(0, 2000, (20, 2))
+    assert table2.mm_to_px(table2.px_to_mm(px)) == pytest.approx(px)
 
 
 def test_column_axis_y_exchanges_x_and_y(table2):
@@ -58,3 +45,55 @@ def test_column_axis_y_exchanges_x_and_y(table2):
     assert table2.to_image_axes(points).tolist() == [[1.0, 2.0, 3.0]]
     assert replace(table2, column_axis="y").to_image_axes(points).tolist() == [[2.0, 1.0, 3.0]]
     assert points.tolist() == [[1.0, 2.0, 3.0]]  # the caller's array is left alone
+
+
+def lattice_of(layout, rotation_rad=0.02, origin=(0.013, -0.027)):
+    return Lattice.regular(0.1, layout, rotation_rad, origin)
+
+
+def test_basis_lengths_angle_and_rotation_from_the_columns_towards_the_rows(layout):
+    lattice = lattice_of(layout)
+    assert lattice.pitch == pytest.approx([0.1, 0.1])
+    cosine = lattice.basis[0] @ lattice.basis[1] / 0.01
+    assert cosine == pytest.approx({"square": 0.0, "hexagonal": 0.5}[layout], abs=1e-12)
+    # 0.12 degrees turn (1, 0) into (cos, sin): ten lenses along the columns rise by 1.0 mm * 0.0020944 along the rows
+    lattice = Lattice.regular(0.1, layout, np.deg2rad(0.12))
+    assert lattice.points((10, 0)) == pytest.approx([0.9999978, 0.0020944], abs=1e-7)
+    assert np.rad2deg(lattice.rotation_rad) == pytest.approx(0.12, rel=1e-12)
+
+
+def test_a_hexagon_has_six_neighbours_at_the_pitch():
+    lattice = lattice_of("hexagonal")
+    steps = np.stack(np.meshgrid([-1, 0, 1], [-1, 0, 1]), axis=-1).reshape(-1, 2)
+    distance = np.linalg.norm(lattice.points(steps) - lattice.points((0, 0)), axis=1)
+    assert np.sum(np.isclose(distance, 0.1)) == 6
+
+
+def test_nearest_by_brute_force_and_by_the_kernel(layout, rng):
+    lattice, steps = lattice_of(layout), np.arange(-12, 13)
+    points = rng.uniform(-0.5, 0.5, (2000, 2))
+    indices = np.stack(np.meshgrid(steps, steps, indexing="ij"), axis=-1).reshape(-1, 2)
+    distance = np.linalg.norm(lattice.points(indices)[np.newaxis] - points[:, np.newaxis], axis=2)
+    assert np.array_equal(lattice.nearest(points), indices[np.argmin(distance, axis=1)])
+    found = np.array([nearest_point(x, y, lattice.origin, lattice.basis) for x, y in points[:500]])
+    assert found == pytest.approx(lattice.points(lattice.nearest(points[:500])), abs=1e-15)
+
+
+def test_rounding_would_name_the_wrong_hexagon_for_one_point_in_six(rng):
+    """That the neighbours must be compared: the test above can fail."""
+    points = rng.uniform(-0.5, 0.5, (20000, 2))
+    for layout, share in (("square", 0.0), ("hexagonal", 1 / 6)):
+        lattice = lattice_of(layout)
+        wrong = np.any(np.rint(lattice.coordinates(points)) != lattice.nearest(points), axis=1).mean()
+        assert wrong == pytest.approx(share, abs=0.01)  # 4 standard deviations of 20,000 trials
+
+
+def test_coordinates_invert_points_that_transformed_and_scaled_lattices_move(layout, rng):
+    lattice = lattice_of(layout)
+    indices = rng.integers(-50, 50, (20, 2))
+    assert lattice.coordinates(lattice.points(indices)) == pytest.approx(indices, abs=1e-10)
+    matrix, shift = np.array([[0.9, 0.2], [-0.1, 1.1]]), np.array([3.0, -4.0])
+    assert lattice.transformed(matrix, shift).points(indices) == pytest.approx(
+        lattice.points(indices) @ matrix.T + shift
+    )
+    assert lattice.scaled(2.5).points(indices) == pytest.approx(2.5 * lattice.points(indices))

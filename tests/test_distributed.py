@@ -10,7 +10,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,7 @@ import pytest
 from lfpiv_cli.console import Console, Frames
 from lfpiv_cli.errors import InputError, OutputError, PartialError, StoppedEarlyError, UsageError
 from lfpiv_cli.files.batch import Target
-from lfpiv_cli.files.shares import claimed
+from lfpiv_cli.files.shares import Shard, claimed
 from lfpiv_cli.notice import Notice
 from lfpiv_cli.verbs.batches import Batch, BatchOptions, Worked, work_through
 
@@ -50,15 +50,6 @@ class Toy(Batch[int]):
         work.console.warn([Notice("frame-dark", str(number), "is dark", "light")])
         self.targets[number].path.write_text(str(number))
         return os.getpid()
-
-
-@pytest.fixture(scope="module")
-def in_process() -> Iterator[str]:
-    """The address of a scheduler with two workers in this process."""
-    with distributed.LocalCluster(
-        n_workers=2, threads_per_worker=1, processes=False, dashboard_address=None
-    ) as cluster:
-        yield cluster.scheduler_address
 
 
 def work(batch: Toy, dask: str, **options: Any) -> tuple[Worked[int], list[Notice]]:
@@ -96,11 +87,6 @@ class Full(Toy):
         raise OutputError(f"{number}: no space left on device")
 
 
-def test_any_other_error_ends_the_batch(in_process: str, tmp_path: Path) -> None:
-    with pytest.raises(OutputError, match="no space left"):
-        work(Full(tmp_path, 4), in_process, keep_going=True)
-
-
 def test_what_another_command_makes_is_left_to_it_and_made_if_it_does_not(in_process: str, tmp_path: Path) -> None:
     batch, ended = Toy(tmp_path, 3), threading.Event()
 
@@ -115,28 +101,24 @@ def test_what_another_command_makes_is_left_to_it_and_made_if_it_does_not(in_pro
     assert sorted(worked.outcomes) == [0, 1, 2]
 
 
-def test_a_share_of_the_outputs_is_made(in_process: str, tmp_path: Path) -> None:
-    from lfpiv_cli.files.shares import Shard
-
+def test_shares_time_limits_and_errors_of_other_kinds(in_process: str, tmp_path: Path) -> None:
     worked, _ = work(Toy(tmp_path, 5), in_process, shard=Shard(2, 2))
     assert list(worked.outcomes) == [2, 3, 4]
-
-
-def test_no_time_is_told(in_process: str, tmp_path: Path) -> None:
     with pytest.raises(StoppedEarlyError, match="0 of 5 frames are done"):
         work(Toy(tmp_path, 5), in_process, time_limit_s=1e-9)
+    with pytest.raises(OutputError, match="no space left"):
+        work(Full(tmp_path, 4), in_process, keep_going=True)
 
 
-def test_an_address_where_nobody_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_address_where_nobody_is_and_a_missing_library_are_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     from lfpiv_cli.verbs import distributed as stage
 
     monkeypatch.setattr(stage, "CONNECT_S", 0.2)
     for address in ("tcp://127.0.0.1:1", "nonsense"):
         with pytest.raises(UsageError, match=f"--dask {address}"):
             work(Toy(tmp_path, 2), address)
-
-
-def test_without_distributed_the_remedy_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "lfpiv_cli.verbs.distributed", None)
     with pytest.raises(UsageError, match=r'pip install "lfpiv\[cluster\]"'):
         work(Toy(tmp_path, 2), "local")
@@ -164,7 +146,7 @@ def test_a_killed_worker_loses_nothing(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_an_output_that_kills_workers_is_named_and_alone(tmp_path: Path) -> None:
+def test_an_output_that_kills_workers_is_named_and_the_others_are_made(tmp_path: Path) -> None:
     worked, warned = work(Toy(tmp_path, 5, deadly=[1]), "local:2", keep_going=True)
     assert written(tmp_path) == list("0234")
     assert [(failure.name, failure.error) for failure in worked.failures] == [
@@ -172,13 +154,11 @@ def test_an_output_that_kills_workers_is_named_and_alone(tmp_path: Path) -> None
     ]
     with pytest.raises(PartialError, match="1 of 5 frames failed, the first because 1: 3 workers ended"):
         worked.ensure_whole({}, "frame")
-
-
-@pytest.mark.slow
-def test_without_keep_going_the_others_are_made_first(tmp_path: Path) -> None:
+    # Without `keep_going` the others are made first.
+    (tmp_path / "more").mkdir()
     with pytest.raises(InputError, match=r"0: 3 workers ended .*; 2 of 3 frames were written before"):
-        work(Toy(tmp_path, 3, deadly=[0]), "local:2")
-    assert written(tmp_path) == list("12")
+        work(Toy(tmp_path / "more", 3, deadly=[0]), "local:2")
+    assert written(tmp_path / "more") == list("12")
 
 
 class Ending(Toy):

@@ -4,25 +4,19 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from lfpiv_cli.errors import InputError, OutputExistsError, UsageError
 from lfpiv_cli.files.atomic import EventLog
-from tests.test_batches import QUICK, images, pairs, raw, run, spoil, stamps, told, weights
-
-__all__ = ["images", "pairs", "raw", "weights"]
-
-
-def dry(capsys: pytest.CaptureFixture[str], *arguments: object) -> dict[str, Any]:
-    return told(capsys, *arguments, "--dry-run")
+from tests.commands import run, told
+from tests.test_batches import QUICK, spoil, stamps
 
 
 def test_a_dry_run_tells_and_writes_nothing(weights, images, tmp_path, capsys) -> None:
     command = ("reconstruct", weights, *images, *QUICK, "-o", tmp_path / "out", "--failures", tmp_path / "failed.json")
     before = stamps(tmp_path)
-    summary = dry(capsys, *command, "--log", tmp_path / "log")
+    summary = told(capsys, *command, "--log", tmp_path / "log", "--dry-run")
     assert stamps(tmp_path) == before
     assert (summary["frames"], summary["to_make"], summary["skipped"], summary["unreadable"]) == (3, 3, 0, 0)
     assert summary["would_make"] == [str(tmp_path / "out" / f"f{number}.vtkhdf") for number in range(3)]
@@ -42,7 +36,7 @@ def test_a_dry_run_believes_what_is_there_and_the_log(weights, images, tmp_path,
     victim.unlink()
     before = [json.loads(line) for line in (tmp_path / "log").read_text().splitlines()]
     frames = [each for each in before if each["event"] == "frame"]
-    summary = dry(capsys, *command)
+    summary = told(capsys, *command, "--dry-run")
     assert [json.loads(line) for line in (tmp_path / "log").read_text().splitlines()] == before
     assert (summary["to_make"], summary["skipped"]) == (1, 2)
     assert summary["would_make"] == [str(victim)]
@@ -65,13 +59,15 @@ def test_a_dry_run_ends_as_the_batch_would(weights, images, tmp_path, capsys) ->
     spoil(images[0], "empty")
     with pytest.raises(InputError, match="f0.tif: is empty"):
         run("reconstruct", weights, *images, *QUICK, *output)
-    summary = dry(capsys, "reconstruct", weights, *images, *QUICK, *output[:2], "--keep-going", "--resume")
+    summary = told(
+        capsys, "reconstruct", weights, *images, *QUICK, *output[:2], "--keep-going", "--resume", "--dry-run"
+    )
     assert (summary["to_make"], summary["skipped"], summary["unreadable"]) == (0, 2, 1)
 
 
 def test_a_dry_run_of_pairs(pairs, tmp_path, capsys) -> None:
     command = ("correlate", *pairs, "--pairing", "ab", "--windows", 8, "--derived", "-o", tmp_path / "out")
-    summary = dry(capsys, *command)
+    summary = told(capsys, *command, "--dry-run")
     assert (summary["pairs"], summary["to_make"]) == (2, 2)
     assert 300.0 < summary["memory_mb"] < 310.0
     run(*command)
@@ -79,8 +75,19 @@ def test_a_dry_run_of_pairs(pairs, tmp_path, capsys) -> None:
     assert written < summary["disk_mb"] < 10.0 * written
     bad = tmp_path / "b1.vtkhdf"
     bad.write_bytes(pairs[3].read_bytes()[:-200])
-    summary = dry(
-        capsys, "correlate", *pairs[:3], bad, "--pairing", "ab", "--keep-going", "-o", tmp_path / "two", "--windows", 8
+    summary = told(
+        capsys,
+        "correlate",
+        *pairs[:3],
+        bad,
+        "--pairing",
+        "ab",
+        "--keep-going",
+        "-o",
+        tmp_path / "two",
+        "--windows",
+        8,
+        "--dry-run",
     )
     assert (summary["to_make"], summary["unreadable"]) == (1, 1)
 

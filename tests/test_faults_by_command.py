@@ -8,7 +8,6 @@ import re
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 
@@ -18,16 +17,12 @@ import tifffile
 
 from lfpiv_cli.files.vtkhdf import open_vectors, write_vectors
 from lfpiv_cli.reference import FOCAL_POINT
+from tests.commands import AT_FOCUS, CONFIG, ROOT, SAMPLE, sample_rig
 from tests.hostile_files import ended
-from tests.test_batches import QUICK, pairs, raw, weights
+from tests.test_batches import QUICK
 from tests.test_cli import hear_interrupts
 from tests.test_particle_stage import frames_of
 from tests.vector_fields import SHAPE, field_of
-
-__all__ = ["pairs", "raw", "weights"]
-
-ROOT = Path(__file__).parent.parent
-CONFIG, SAMPLE = ROOT / "configs" / "sample.yaml", ROOT / "sample_data"
 
 
 @pytest.fixture
@@ -103,7 +98,9 @@ def test_two_commands_of_one_target_leave_one_whole_file(vectors: Path) -> None:
 
 
 @pytest.mark.slow
-def test_one_bad_frame_of_a_hundred_leaves_the_others_as_they_are(tmp_path: Path, weights: Path, raw) -> None:
+def test_one_bad_frame_of_a_hundred_leaves_the_others_as_they_are(
+    tmp_path: Path, weights: Path, raw: np.ndarray
+) -> None:
     frames = [tmp_path / f"f{number:02d}.tif" for number in range(100)]
     for number, path in enumerate(frames):
         tifffile.imwrite(path, raw + np.uint16(number), compression="zlib")
@@ -122,19 +119,20 @@ def test_one_bad_frame_of_a_hundred_leaves_the_others_as_they_are(tmp_path: Path
 NAMES = ("build-weights", "calibrate-snapshot", "simulate", "correlate", "track")
 
 
-def work(name: str, folder: Path, pairs: list[Path], rng: np.random.Generator) -> tuple[list[str], str]:
-    """Return a command that works for a while, but for its output, and how the name of that ends."""
-    rig = folder / "rig.yaml"
-    rig.write_text(CONFIG.read_text().replace("reference: mid_plane", "reference: focal_point"))
+def work(name: str, folder: Path, pairs: list[Path], rng: np.random.Generator) -> tuple[list[str], str, float]:
+    """Return a command that works for a while, but for its output; how the name of that ends, and the seconds taken."""
     words: dict[str, tuple[object, ...]] = {
-        "build-weights": (rig,),
+        "build-weights": (sample_rig(folder, AT_FOCUS),),
         "calibrate-snapshot": (CONFIG, "--white", SAMPLE / "white.tif"),
         "simulate": ("white", CONFIG),
         "correlate": (*pairs[:2], "--windows", 8),
         "track": tuple(frames_of([300] * 3, folder, rng)) if name == "track" else (),
     }
     end = {"build-weights": ".h5", "calibrate-snapshot": ".h5", "simulate": ""}.get(name, ".vtkhdf")
-    return command(name, *words[name], "-q"), end
+    begun = os.times().elapsed
+    assert subprocess.run([*command(name, *words[name], "-q"), "-o", folder / f"made{end}"], cwd=ROOT).returncode == 0
+    (folder / "out").mkdir()
+    return command(name, *words[name], "-q"), end, os.times().elapsed - begun
 
 
 @pytest.mark.slow
@@ -143,13 +141,9 @@ def work(name: str, folder: Path, pairs: list[Path], rng: np.random.Generator) -
 def test_what_was_killed_at_any_moment_can_be_made_again(
     tmp_path: Path, pairs: list[Path], name: str, rng: np.random.Generator
 ) -> None:
-    words, end = work(name, tmp_path, pairs, rng)
+    words, end, takes_s = work(name, tmp_path, pairs, rng)
     folder = tmp_path / "out"
-    folder.mkdir()
     made, whole = folder / f"made{end}", tmp_path / f"made{end}"
-    begun = os.times().elapsed
-    assert subprocess.run([*words, "-o", whole], cwd=ROOT).returncode == 0
-    takes_s = os.times().elapsed - begun
     again = [*words, "--overwrite", "-o", str(made)]
     for _ in range(6):
         with subprocess.Popen(again, cwd=ROOT) as process:
@@ -171,13 +165,8 @@ def test_what_was_killed_at_any_moment_can_be_made_again(
 def test_signals_end_each_command_within_five_seconds(
     tmp_path: Path, pairs: list[Path], name: str, sent: int, code: int, rng: np.random.Generator
 ) -> None:
-    words, end = work(name, tmp_path, pairs, rng)
-    folder = tmp_path / "out"
-    folder.mkdir()
-    begun = os.times().elapsed
-    assert subprocess.run([*words, "-o", tmp_path / f"made{end}"], cwd=ROOT).returncode == 0
-    takes_s = os.times().elapsed - begun
-    ends = []
+    words, end, takes_s = work(name, tmp_path, pairs, rng)
+    folder, ends = tmp_path / "out", []
     for share in (0.5, 0.7, 0.9):
         command = [*words, "-o", folder / f"made{end}"]
         with subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, preexec_fn=hear_interrupts) as process:
@@ -209,39 +198,36 @@ def quiet_environment(**changes: str | None) -> dict[str, str]:
 @pytest.mark.parametrize("terminal", [False, True])
 def test_no_colour_is_sent_where_none_is_wanted(vectors: Path, terminal: bool) -> None:
     outer, inner = os.openpty()
-    target = vectors.with_name("combined.vtkhdf")
-    words = command("combine", vectors, vectors, "-o", target)
+    words = command("combine", vectors, vectors, "-o", vectors.with_name("combined.vtkhdf"))
     environment = quiet_environment(NO_COLOR="1", FORCE_COLOR=None)
-    heard = inner if terminal else subprocess.PIPE
+    heard, said = inner if terminal else subprocess.PIPE, b""
     with subprocess.Popen(words, cwd=ROOT, env=environment, stdout=heard, stderr=heard) as process:
         os.close(inner)
-        said = b"".join(heard_of(outer)) if terminal else b"".join(process.communicate(timeout=60))
+        with suppress(OSError):  # until nobody holds the terminal's other end
+            while terminal and (content := os.read(outer, 4096)):
+                said += content
+        said += b"" if terminal else b"".join(process.communicate(timeout=60))
     os.close(outer)
     assert process.returncode == 0
     assert b"vectors" in said
     assert not re.search(rb"\x1b\[[0-9;]*m", said)
 
 
-def heard_of(terminal: int) -> Iterator[bytes]:
-    """Yield what a terminal is sent until nobody holds its other end."""
-    with suppress(OSError):
-        while content := os.read(terminal, 4096):
-            yield content
-
-
 @pytest.mark.thorough
-def test_a_command_needs_no_home(vectors: Path) -> None:
-    words = command("combine", vectors, vectors, "-q", "-o", vectors.with_name("combined.vtkhdf"))
-    nowhere = quiet_environment(HOME=None, XDG_CACHE_HOME=None, NUMBA_CACHE_DIR=None, MPLCONFIGDIR=None)
-    done = subprocess.run(words, cwd=ROOT, env=nowhere, capture_output=True, text=True, timeout=60)
-    assert (done.returncode, done.stderr) == (0, "")
-
-
-@pytest.mark.thorough
-def test_no_screen_is_needed_to_draw(vectors: Path) -> None:
-    words = command("plot", vectors, "-q", "-o", vectors.with_name("v.png"))
-    elsewhere = quiet_environment(MPLBACKEND="bogus")
-    done = subprocess.run(words, cwd=ROOT, env=elsewhere, capture_output=True, text=True, timeout=120)
+@pytest.mark.parametrize(
+    ("words", "changes"),
+    [
+        (("combine", "{}", "{}", "-o", "{}_2"), dict.fromkeys(("HOME", "XDG_CACHE_HOME", "NUMBA_CACHE_DIR"))),
+        (("plot", "{}", "-o", "{}.png"), {"MPLBACKEND": "bogus", "DISPLAY": None}),
+    ],
+    ids=["home", "screen"],
+)
+def test_neither_home_nor_screen_is_needed(
+    vectors: Path, words: tuple[str, ...], changes: list[tuple[str, str]]
+) -> None:
+    environment = quiet_environment(MPLCONFIGDIR=None, **changes)
+    given = command(*(word.format(vectors) for word in words), "-q")
+    done = subprocess.run(given, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=120)
     assert (done.returncode, done.stderr) == (0, "")
 
 

@@ -18,13 +18,12 @@ from lfpiv_cli.grid import Grid
 from lfpiv_cli.reference import FOCAL_POINT
 from lfpiv_cli.validation.planning import depth_of_field_mm
 from lfpiv_cli.verbs import planning
+from tests.commands import AT_FOCUS, CONFIG, SAMPLE, sample_rig
 from tests.hostile_files import ended
-from tests.test_batches import QUICK, images, raw, weights
+from tests.test_batches import QUICK
 
-__all__ = ["images", "raw", "weights"]
-
-SAMPLE_RIG = Path(__file__).parent.parent / "configs" / "sample.yaml"
 STATUS = "Name:\tpython\nVmSize:\t 1000000 kB\nVmRSS:\t 500000 kB\n"
+PAIR = (SAMPLE / "pair_a.tif", SAMPLE / "pair_b.tif")
 
 
 @pytest.fixture
@@ -84,19 +83,15 @@ def test_other_systems_set_no_limit(monkeypatch: pytest.MonkeyPatch, tmp_path: P
     inputs.ensure_room(1e18, "work")
 
 
-def test_a_correlation_that_does_not_fit_is_not_begun(system: Path, tmp_path: Path) -> None:
+def test_work_that_does_not_fit_is_not_begun(system: Path, tmp_path: Path, weights: Path, images: list[Path]) -> None:
     pair = volume(tmp_path / "a.vtkhdf", 0), volume(tmp_path / "b.vtkhdf", 1)
-    config = Path(__file__).parent.parent / "configs" / "sample.yaml"
     target = tmp_path / "v.vtkhdf"
-    command = ("correlate", *pair, "--config", config, "--dt-s", 0.001, "--windows", 8, "-o", target)
+    command = ("correlate", *pair, "--config", CONFIG, "--dt-s", 0.001, "--windows", 8, "-o", target)
     (system / "meminfo").write_text("MemAvailable: 100 kB\n")
     code, said = ended(*command)
     assert code == 7
     assert "too little memory: correlate needs 0.30 GB" in said
     assert not target.exists()
-
-
-def test_a_reconstruction_that_does_not_fit_is_not_begun(system: Path, weights, images, tmp_path: Path) -> None:
     command = ("reconstruct", weights, images[0], *QUICK, "-o", tmp_path / "v.vtkhdf")
     for kilobytes, words in ((0, f"reading {weights} needs"), (1000, "reconstruct needs")):
         (system / "meminfo").write_text(f"MemAvailable: {kilobytes} kB\n")
@@ -122,29 +117,12 @@ def test_a_correlation_takes_what_was_measured(
     assert 1 / 1.3 < held_bytes(shape, settings) / 1e6 / measured_mb < 1.3
 
 
-def rig_of(folder: Path, old: str, new: str) -> Path:
-    """Write the sample's rig with another volume or sensor."""
-    rig = folder / "rig.yaml"
-    text = SAMPLE_RIG.read_text().replace("reference: mid_plane", "reference: focal_point")
-    assert old in text
-    rig.write_text(text.replace(old, new))
-    return rig
-
-
-PICTURES = [SAMPLE_RIG.parent.parent / "sample_data" / name for name in ("pair_a.tif", "pair_b.tif", "white.tif")]
-
-
 @pytest.mark.parametrize(
     ("old", "new", "words", "said_of"),
     [
-        ("[30, 22, 40]", "[4000, 4000, 4000]", ("build-weights", "{rig}"), "4000 x 4000 x 4000 voxels needs 512.30 GB"),
-        (
-            "[30, 22, 40]",
-            "[4000, 4000, 4000]",
-            ("run", "{rig}", *PICTURES[:2]),
-            "4000 x 4000 x 4000 voxels needs 512.30",
-        ),
-        ("[30, 22, 40]", "[800, 800, 800]", ("run", "{rig}", *PICTURES[:2], "--method", "volumes"), "needs 16.70 GB"),
+        ("[30, 22, 40]", "[4000, 4000, 4000]", ("build-weights", "{rig}"), "4000 x 4000 x 4000 voxels needs 512.30"),
+        ("[30, 22, 40]", "[4000, 4000, 4000]", ("run", "{rig}", *PAIR), "4000 x 4000 x 4000 voxels needs 512.30"),
+        ("[30, 22, 40]", "[800, 800, 800]", ("run", "{rig}", *PAIR, "--method", "volumes"), "needs 16.70 GB"),
         ("columns: 600, rows: 448", "columns: 20000, rows: 20000", ("simulate", "white", "{rig}"), "needs 13.90 GB"),
         ("columns: 600, rows: 448", "columns: 20000, rows: 20000", ("simulate", "board", "{rig}"), "needs 13.90 GB"),
     ],
@@ -152,8 +130,8 @@ PICTURES = [SAMPLE_RIG.parent.parent / "sample_data" / name for name in ("pair_a
 def test_work_that_does_not_fit_is_refused_before_any(
     system: Path, tmp_path: Path, old: str, new: str, words: tuple[object, ...], said_of: str
 ) -> None:
-    rig, output = rig_of(tmp_path, old, new), tmp_path / "output"
-    white = ("--white", PICTURES[2]) if words[0] == "run" else ()
+    rig, output = sample_rig(tmp_path, AT_FOCUS, (old, new)), tmp_path / "output"
+    white = ("--white", SAMPLE / "white.tif") if words[0] == "run" else ()
     code, said = ended(*(str(word).format(rig=rig) for word in words), *white, "-o", output)
     assert (code, said_of in said, "10.24 GB are left of this machine" in said) == (7, True, True), said
     assert not output.exists()
@@ -163,7 +141,7 @@ def test_work_that_does_not_fit_is_refused_before_any(
 def test_weights_that_the_disk_has_no_room_for_are_not_begun(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     usage = shutil.disk_usage(tmp_path)
     monkeypatch.setattr(inputs.shutil, "disk_usage", lambda _: usage._replace(free=1_000))
-    rig = rig_of(tmp_path, "fluid: 1.33}", "fluid: 1.33}")
+    rig = sample_rig(tmp_path, AT_FOCUS)
     code, said = ended("build-weights", rig, "-o", tmp_path / "w.h5")
     assert (code, "w.h5: needs 0.00 GB, and 0.00 GB are free on the disk" in said) == (7, True), said
 
@@ -174,7 +152,7 @@ def test_a_volume_far_beyond_what_can_be_refocused_is_judged_at_its_end(monkeypa
         planning.planning, "in_miniature", lambda _camera, _media, depths_mm, *_: asked.append(depths_mm)
     )
     monkeypatch.setattr(planning.planning, "errors_by_depth_mm", lambda *_: np.ones((len(asked[0]), 3)))
-    settings = load_config(SAMPLE_RIG).overridden("volume", reference="focal_point", shape_xyz=(4000, 4000, 4000))
+    settings = load_config(CONFIG).overridden("volume", reference="focal_point", shape_xyz=(4000, 4000, 4000))
     bench = planning.bench_of(settings, None)
     assert bench.errors_mm.shape == (planning.DEPTHS, 3)
     far = planning.FARTHEST_FIELDS * depth_of_field_mm(bench.camera, bench.media)

@@ -1,0 +1,230 @@
+"""Vector fields: their units and flags, what is derived of them, and what they say against their own vectors."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from lfpiv_cli.flow.combining import Paths, WindowGrid, vectors_from_paths
+from lfpiv_cli.flow.correlation import correlate
+from lfpiv_cli.flow.field import (
+    MASKED,
+    REJECTED,
+    REPLACED,
+    SECOND_PEAK,
+    VALID,
+    VectorField,
+    derived_fields,
+    difference_over_stated,
+    divergence_over_stated,
+)
+from lfpiv_cli.flow.outliers import INTERPOLATION_VOXEL, mixing, smooth_field, unresolved
+from lfpiv_cli.flow.peaks import LOCKING_LENSES, with_locking
+from lfpiv_cli.flow.windows import CorrelationSettings
+from lfpiv_cli.grid import Grid
+from lfpiv_cli.reference import Reference
+from lfpiv_cli.scale import Scale
+from tests.vector_fields import SHAPE, SIGMA_VOXEL, SPACING_MM, VOXEL_MM, field_of, noise_mm, places_mm, rotation_mm
+
+
+@pytest.mark.parametrize("understated", [1.0, 5.0])
+def test_divergence_tells_by_how_much_errors_are_understated(understated: float) -> None:
+    field = field_of(rotation_mm() + noise_mm(0), SIGMA_VOXEL / understated)
+    # 504 places, each sharing vectors with its neighbours: the median of so many scatters by a few hundredths.
+    assert divergence_over_stated(field) == pytest.approx(understated, rel=0.15)
+
+
+def test_a_source_shows_and_vectors_that_are_not_there_do_not_count() -> None:
+    strength = 0.2
+    field = field_of(strength * places_mm() + noise_mm(1), SIGMA_VOXEL)
+    variance = sum((SIGMA_VOXEL * VOXEL_MM)[k] ** 2 / (2.0 * SPACING_MM[k] ** 2) for k in range(3))
+    assert divergence_over_stated(field) == pytest.approx(3.0 * strength / np.sqrt(variance) / 0.6745, rel=0.1)
+    moved = rotation_mm() + noise_mm(2)
+    moved[4, 4, 4] = 1e3
+    field = field_of(moved, SIGMA_VOXEL)
+    field.flag[4, 4, 4] = MASKED
+    assert divergence_over_stated(field) == pytest.approx(1.0, rel=0.15)
+
+
+def test_what_cannot_be_known_is_none() -> None:
+    assert divergence_over_stated(field_of(noise_mm(0), None)) is None
+    field = field_of(noise_mm(0), SIGMA_VOXEL)
+    elsewhere = replace(field, grid=Grid(SHAPE[::-1], SPACING_MM, (-4.0, 1.0, 2.5)))
+    assert difference_over_stated(field, elsewhere) is None
+    field.flag[2:] = MASKED
+    assert divergence_over_stated(field) is None
+    assert difference_over_stated(field, field_of(noise_mm(0), None)) is None
+
+
+def test_two_measurements_differ_by_what_they_state_but_for_a_component_that_is_off() -> None:
+    one, other = (field_of(rotation_mm() + noise_mm(seed), SIGMA_VOXEL) for seed in (3, 4))
+    assert difference_over_stated(one, other) == pytest.approx([1.0, 1.0, 1.0], rel=0.1)
+    moved = rotation_mm() + noise_mm(5)
+    other = moved + noise_mm(6)
+    other[..., 1] += 10.0 * (SIGMA_VOXEL * VOXEL_MM)[1]
+    found = difference_over_stated(field_of(moved, SIGMA_VOXEL), field_of(other, SIGMA_VOXEL))
+    assert found is not None
+    assert found[1] > 8.0
+    assert max(found[0], found[2]) < 1.2
+
+
+def linear_field(gradient: np.ndarray, shape: tuple[int, int, int] = (4, 5, 6)) -> VectorField:
+    """A linear flow of a given gradient (1/s), in voxels of 0.1 x 0.1 x 0.2 mm and 1 ms."""
+    grid = Grid(shape[::-1], (0.8, 0.4, 1.6), (-1.0, 2.0, 0.5))
+    moved = grid.centres_mm() * 1e-3 @ gradient.T * 1e-3 / (np.array([0.1, 0.1, 0.2]) * 1e-3)
+    ones, flag = np.ones(shape), np.zeros(shape, dtype=np.uint8)
+    return VectorField(grid, moved, moved, ones, ones, ones, flag, None, (0.1, 0.1, 0.2), 1e-3, (8, 8, 8))
+
+
+def test_rotation_shear_and_expansion() -> None:
+    # Rigid rotation has twice its rate as vorticity, and no strain.
+    rate = np.array([3.0, -5.0, 7.0])
+    derived = derived_fields(linear_field(np.cross(np.eye(3), rate)))
+    np.testing.assert_allclose(derived.vorticity, np.broadcast_to(2.0 * rate, derived.vorticity.shape), rtol=1e-9)
+    np.testing.assert_allclose(derived.strain_rate, 0.0, atol=1e-9)
+    np.testing.assert_allclose(derived.divergence, 0.0, atol=1e-9)
+    np.testing.assert_allclose(derived.q_criterion, rate @ rate, rtol=1e-9)
+    # Simple shear turns as much as it strains.
+    gradient = np.zeros((3, 3))
+    gradient[0, 2] = 30.0
+    derived = derived_fields(linear_field(gradient))
+    # du/dz > 0 turns from z towards x, right-handed about +y.
+    np.testing.assert_allclose(derived.vorticity, np.broadcast_to([0.0, 30.0, 0.0], derived.vorticity.shape), atol=1e-9)
+    np.testing.assert_allclose(derived.strain_rate, 30.0, rtol=1e-9)
+    np.testing.assert_allclose(derived.q_criterion, 0.0, atol=1e-6)
+    # Expansion is divergence only.
+    derived = derived_fields(linear_field(np.diag([1.0, 2.0, 4.0])))
+    np.testing.assert_allclose(derived.divergence, 7.0, rtol=1e-9)
+    np.testing.assert_allclose(derived.vorticity, 0.0, atol=1e-9)
+    assert derived.divergence_rms == pytest.approx(7.0)
+
+
+def test_gradients_are_unknown_where_vectors_are_missing_or_there_is_one_plane() -> None:
+    field = linear_field(np.diag([1.0, 2.0, 4.0]))
+    flag = field.flag.copy()
+    flag[2, 2, 3] = REJECTED
+    divergence = derived_fields(replace(field, flag=flag)).divergence
+    assert np.isnan(divergence[2, 2, 2])
+    assert np.isnan(divergence[2, 2, 4])
+    assert np.isfinite(divergence[0, 0, 0])
+    assert derived_fields(linear_field(np.eye(3), (1, 5, 6))).divergence_rms is None
+
+
+def test_velocity_is_displacement_over_time_in_metres_up_to_the_second_peak() -> None:
+    displacement, ones = np.tile([1.0, -2.0, 0.5], (1, 1, 5, 1)), np.ones((1, 1, 5))
+    flag = np.array([VALID, REPLACED, SECOND_PEAK, REJECTED, MASKED], dtype=np.uint8).reshape(1, 1, 5)
+    grid, voxel = Grid((5, 1, 1), (0.8, 0.8, 0.8), (0.0, 0.0, 0.0)), (0.1, 0.1, 0.2)
+    field = VectorField(grid, displacement, displacement, ones, ones, ones, flag, None, voxel, 0.0018, (16, 16, 8))
+    # One voxel of 0.1 mm in 1.8 ms is 0.0556 m/s; along z the voxel is twice as long.
+    np.testing.assert_allclose(field.velocity[0, 0, 0], [0.1e-3 / 0.0018, -0.2e-3 / 0.0018, 0.1e-3 / 0.0018])
+    assert np.array_equal(np.isfinite(field.velocity[0, 0, :, 0]), [True, True, True, False, False])
+    assert np.all(np.isfinite(field.displacement_voxel))
+    assert np.all(np.isnan(replace(field, dt_s=None).velocity))
+
+
+SCALE = Scale(lens_mm=0.1, depth_mm=1.0)
+
+
+def test_lateral_uncertainty_grows_in_the_focal_plane_alone(rng: np.random.Generator) -> None:
+    grid = Grid((16, 16, 48), (0.05, 0.1, 0.2), (0.0, 0.0, -2.0))
+    volume = rng.random(grid.shape_zyx).astype(np.float32)
+    field = correlate([(volume, volume)], grid, CorrelationSettings([(8, 8, 8)], (0.5, 0.5, 0.5)))
+    field = replace(field, uncertainty_voxel=np.zeros_like(field.uncertainty_voxel))
+    # The focal plane lies at -1.2 mm in the volume's coordinates.
+    stated = with_locking(field, Reference("mid_plane", 1.2), SCALE).uncertainty_voxel
+    assert stated is not None
+    assert np.all(stated[..., 2] == 0.0)
+    np.testing.assert_allclose(stated[..., 0] * 0.05, stated[..., 1] * 0.1)
+    depth = field.grid.axis_mm(2) + 1.2
+    np.testing.assert_allclose(stated[:, 0, 0, 0] * 0.05, LOCKING_LENSES * 0.1 * np.exp(-0.5 * depth**2), rtol=1e-12)
+
+
+VOLUME = Grid.centred((40, 30, 20), (0.1, 0.1, 0.2), (0.0, 0.0, 0.0))
+WINDOWS = WindowGrid(VOLUME, (8, 8, 4), (0.5, 0.5, 0.5))
+
+
+def paths_in(count: int, share: float, rng: np.random.Generator) -> Paths:
+    """Tracks in a share of the volume's width, from its lower end on."""
+    low, high = np.array([VOLUME.bounds_mm(axis) for axis in range(3)]).T
+    high[0] = low[0] + share * (high[0] - low[0])
+    points = rng.uniform(low, high, (count, 3))
+    return Paths(points, np.tile((0.05, 0.0, 0.0), (count, 1)), np.full((count, 3), 0.002))
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("count", [200, 1000])
+def test_a_region_without_tracks_has_no_vectors(count: int, rng: np.random.Generator) -> None:
+    field = vectors_from_paths(paths_in(count, 0.6, rng), WINDOWS, None)
+    low, high = VOLUME.bounds_mm(0)
+    away = field.grid.axis_mm(0) - (low + 0.6 * (high - low))
+    # Nearer than the tracks are to each other nobody can tell.
+    assert np.all(field.flag[:, :, away > (0.5 if count == 1000 else 0.9)] == REJECTED)
+    assert np.isnan(field.displacement_voxel[field.flag == REJECTED]).all()
+    assert np.all(field.flag[:, :, away < 0.0] == VALID)
+
+
+@pytest.mark.parametrize("count", [80, 300, 3000])
+def test_even_seeding_has_no_empty_regions(count: int, rng: np.random.Generator) -> None:
+    # Where tracks are few the fit's reach may leave gaps of its own.
+    wide = WindowGrid(VOLUME, (16, 16, 8), (0.5, 0.5, 0.5))
+    field = vectors_from_paths(paths_in(count, 1.0, rng), wide, None)
+    assert np.all(field.flag == VALID)
+
+
+WINDOWED = (12, 16, 12)
+
+
+def polynomial_field(degree: int) -> NDArray[np.float64]:
+    z, y, x = np.meshgrid(*(np.arange(n, dtype=np.float64) for n in WINDOWED), indexing="ij")
+    return np.stack([0.7 * y**degree - 0.3 * z, 0.5 * x**degree, 0.2 * x - 0.1 * z**degree], axis=-1)
+
+
+def test_filter_keeps_linear_flows_and_short_axes_and_damps_noise_everywhere(rng: np.random.Generator) -> None:
+    linear = polynomial_field(1)
+    np.testing.assert_allclose(smooth_field(linear), linear, atol=1e-12)
+    noise = rng.normal(size=(*WINDOWED, 3))
+    smoothed = smooth_field(noise)
+    assert np.std(smoothed) < 0.6 * np.std(noise)
+    assert np.std(smoothed[0, 0]) < np.std(noise[0, 0])
+    field = np.arange(12.0).reshape(1, 2, 2, 3)
+    np.testing.assert_allclose(smooth_field(field), field, rtol=1e-12)
+
+
+def test_filter_keeps_curved_flows_away_from_the_borders_and_parabolas_at_them() -> None:
+    cubic = polynomial_field(3)
+    # The straight line at the ends is felt by two windows.
+    inner = (slice(2, -2),) * 3
+    np.testing.assert_allclose(smooth_field(cubic)[inner], cubic[inner], atol=1e-9)
+    parabola = polynomial_field(2)
+    # With the straight line through the outer three values at the ends, 2 F - F F would miss -0.1 z^2 by 5/36 of that.
+    lost = np.abs(smooth_field(parabola) - parabola)[0, 8, 6, 2]
+    assert lost < 0.5 * 0.1 * 5.0 / 36.0
+
+
+def test_what_is_not_resolved_is_nothing_in_a_linear_flow_and_grows_around_a_spike() -> None:
+    field = polynomial_field(1)
+    np.testing.assert_allclose(unresolved(field), INTERPOLATION_VOXEL, rtol=1e-6)
+    field[6, 8, 6, 1] += 1.0
+    left = unresolved(field)[..., 1]
+    # 1 - (10 / 16)^3 of the spike itself goes, shared with the 26 neighbours' smaller losses.
+    lost = 1.0 - (10 / 16) ** 3
+    assert lost / np.sqrt(27.0) < left[6, 8, 6] < 1.2 * lost / np.sqrt(27.0)
+    assert left[5, 7, 7] > 0.9 * left[6, 8, 6]
+    assert left[0, 0, 0] == pytest.approx(INTERPOLATION_VOXEL, rel=1e-6)
+
+
+def test_mixing_is_the_mean_over_a_particle_s_length() -> None:
+    sigma, step = 6.0, 8
+    field = polynomial_field(2)
+    places = np.linspace(-30.0, 30.0, 601)
+    weights = np.exp(-((places / sigma) ** 2))
+    mean = np.average(np.square(places), weights=weights) / step**2
+    found = mixing(field, np.array([0.0, 0.0, sigma]), (step,) * 3)
+    # Away from the ends, whose straight lines bend the parabola. Only the third component is curved along z, by -0.2.
+    inner = (slice(2, -2),) * 3
+    np.testing.assert_allclose(found[inner], np.broadcast_to([0.0, 0.0, -0.1 * mean], found[inner].shape), atol=1e-6)
+    assert np.all(found[0] == 0.0)
+    assert np.all(mixing(field, np.zeros(3), (step,) * 3) == 0.0)
