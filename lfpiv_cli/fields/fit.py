@@ -19,7 +19,6 @@ from lfpiv_cli.arrays import Floats
 from lfpiv_cli.fields.spline_field import SplineField, lattice_for, spline_field
 from lfpiv_cli.fields.structure import (
     INDEPENDENT,
-    Estimates,
     Samples,
     VectorStructure,
     between,
@@ -29,7 +28,7 @@ from lfpiv_cli.fields.structure import (
     unknown_variance,
 )
 from lfpiv_cli.robust import MAD_TO_SIGMA
-from lfpiv_cli.tracks.gridding import FEWEST_OF_STRUCTURE, ROUGH_EXPONENT, without_own
+from lfpiv_cli.tracks.gridding import FEWEST_OF_STRUCTURE, ROUGH_EXPONENT, spacing_of, spread_around, without_own
 
 # A velocity field kriged from samples as vectors: the best linear unbiased estimate where the flow is rough.
 #
@@ -67,11 +66,6 @@ FARTHEST = 10.0
 STEPS, ENOUGH = 25, 1e-5
 # What stands for a likelihood of none.
 IMPOSSIBLE = 1e12
-
-
-def spacing_of(points: Floats) -> float:
-    """Return the median distance of a point's nearest neighbour, mm."""
-    return float(np.median(KDTree(points).query(points, k=[2])[0]))
 
 
 def likeliest_structure(
@@ -138,8 +132,6 @@ OUTLIER_ROUNDS = 2
 LARGEST_PROBABILITY = 0.99
 # Neighbours in all directions are so many times as far away as the nearest one.
 SPACINGS_APART = 2.0
-# Samples around a place that show how large errors are there.
-AROUND = 40
 # The median of chi-squared of three degrees of freedom.
 CHI_SQUARED_MEDIAN = 2.0 * float(gammaincinv(1.5, 0.5))
 # The shares of potential flow to choose from.
@@ -170,32 +162,30 @@ class KrigedField:
 
     def value_at(self, points_mm: Floats) -> Floats:
         """Return displacements (m, 3) in mm."""
-        return self.estimates_at(points_mm).value_mm
+        return self.estimates_at(points_mm)[0]
 
     def variance_at(self, points_mm: Floats) -> Floats:
         """Return the variances (m, 3) in mm^2 of what the displacements are off by."""
         return self.estimate_at(points_mm)[1]
 
-    def estimates_at(self, points_mm: Floats) -> Estimates:
+    def estimates_at(self, points_mm: Floats) -> tuple[Floats, Floats]:
         """Return displacements and their covariances at once, in the time that either takes."""
         unknown = unknown_variance(self.samples)
         parts = [
             estimated(points_mm[part], near, self.samples, self.structure, unknown)
             for part, near in _nearest(self.samples.points_mm, points_mm, USED)
         ]
-        covariance = np.concatenate([part.covariance_mm2 for part in parts])
+        value, covariance = (np.concatenate(each) for each in zip(*parts, strict=True))
         # How large errors are around places over what the equations say.
         everywhere = MAD_TO_SIGMA * np.median(self.off_by, axis=0)
-        count = min(AROUND, len(self.samples))
-        near = KDTree(self.samples.points_mm).query(points_mm, k=np.arange(1, count + 1))[1]
-        factor = np.maximum(everywhere, MAD_TO_SIGMA * np.median(self.off_by[near], axis=1))
+        factor = np.maximum(everywhere, spread_around(points_mm, self.samples.points_mm, self.off_by))
         scaled = covariance * factor[:, :, np.newaxis] * factor[:, np.newaxis]
-        return Estimates(np.concatenate([part.value_mm for part in parts]), scaled)
+        return value, scaled
 
     def estimate_at(self, points_mm: Floats) -> tuple[Floats, Floats]:
         """Return displacements and their variances (m, 3)."""
-        found = self.estimates_at(points_mm)
-        return found.value_mm, np.asarray(np.einsum("mii->mi", found.covariance_mm2))
+        value, covariance = self.estimates_at(points_mm)
+        return value, np.asarray(np.einsum("mii->mi", covariance))
 
     def gradient_at(self, points_mm: Floats) -> Floats:
         """Return the gradient (m, 3, 3) per mm [component, direction], each of its nearest samples held fixed."""
@@ -281,9 +271,8 @@ def _without_outliers(
         off, covariance = np.empty((len(samples), 3)), np.empty((len(samples), 3, 3))
         for part, near in _nearest(others.points_mm, samples.points_mm, count + 1):
             near = without_own(near, number[part])
-            found = estimated(samples.points_mm[part], near, others, structure, unknown)
-            off[part] = samples.value_mm[part] - found.value_mm
-            covariance[part] = found.covariance_mm2 + own[part]
+            expected, missed = estimated(samples.points_mm[part], near, others, structure, unknown)
+            off[part], covariance[part] = samples.value_mm[part] - expected, missed + own[part]
         # Which belong to the flow rather than being off by the order of their neighbours' distance.
         of_flow = np.einsum("ni,ni->n", off, np.linalg.solve(covariance, off[..., np.newaxis])[..., 0])
         times = max(float(np.median(of_flow)) / CHI_SQUARED_MEDIAN, 1.0)

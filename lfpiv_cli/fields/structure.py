@@ -216,20 +216,6 @@ UNKNOWN_TIMES = 100.0
 SMALLEST_SHARE = 1e-12
 
 
-@dataclass(frozen=True, eq=False)
-class Estimates:
-    """What the samples say at m places.
-
-    Attributes
-    ----------
-    value_mm : (m, 3)
-    covariance_mm2 : (m, 3, 3) of what the value is off by
-    """
-
-    value_mm: Floats
-    covariance_mm2: Floats
-
-
 def unknown_variance(samples: Samples) -> float:
     """Return the variance of the constant of each neighbourhood, mm^2."""
     spread = float(np.var(samples.value_mm, axis=0).max())
@@ -317,8 +303,10 @@ def log_likelihood(matrices: Floats, values: Floats) -> float:
 
 def estimated(
     at: Floats, near: NDArray[np.int64], samples: Samples, structure: VectorStructure, unknown: float
-) -> Estimates:
-    """Return the estimates at places (b, 3) from the samples `near` (b, k)."""
+) -> tuple[Floats, Floats]:
+    """Return the estimates (b, 3) at places (b, 3) from the samples `near` (b, k), and their errors' covariances (b, 3,
+    3).
+    """
     points, values = samples.points_mm[near], samples.value_mm[near]
     middle, usual = points.mean(axis=1, keepdims=True), values.mean(axis=1)
     matrices = between(points, samples.covariance_mm2[near], structure, unknown)
@@ -330,7 +318,7 @@ def estimated(
     weights = weights_of(matrices, aim)
     about = (values - usual[:, np.newaxis]).swapaxes(1, 2).reshape(len(at), 1, -1)
     missed = 2.0 * own[:, :, 0] + unknown * np.eye(3) - aim.swapaxes(1, 2) @ weights
-    return Estimates(usual + (about @ weights)[:, 0], 0.5 * (missed + missed.swapaxes(1, 2)))
+    return usual + (about @ weights)[:, 0], 0.5 * (missed + missed.swapaxes(1, 2))
 
 
 def estimated_slopes(

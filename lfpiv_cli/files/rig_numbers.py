@@ -26,7 +26,6 @@ from lfpiv_cli.validation.planning import (
     BEST_PER_LENS,
     depth_of_field_mm,
     half_view_mm,
-    matched_f_number,
     proposed_window_mm,
     time_step_s,
     tracers_in,
@@ -185,7 +184,8 @@ class RigNumbers:
         ConfigError : the sensor sees no such volume
         """
         microlens = self.microlens_focal_length_mm or 8.0 * self.pitch_mm
-        f_number = self.f_number or _rounded(matched_f_number(self.magnification, microlens / self.pitch_mm))
+        # with this F_m / p_m lens images just touch: the main lens's cone is that of the microlenses
+        f_number = self.f_number or _rounded(microlens / self.pitch_mm / (1.0 - self.magnification))
         filled = replace(self, microlens_focal_length_mm=microlens, f_number=f_number)
         if self.size_mm is not None:
             return filled

@@ -305,22 +305,10 @@ def kinetic_energy(stresses: Floats) -> float:
     return 0.5 * float(np.trace(stresses))
 
 
-@dataclass(frozen=True)
-class Dissipation:
-    """The rate at which friction takes kinetic energy, m^2/s^3.
+def dissipation(gradient: Floats, covariance: Floats, viscosity_m2_s: float, independent: float) -> tuple[float, float]:
+    """Return the rate at which friction takes kinetic energy, 2 nu <s_ij s_ij>, m^2/s^3, and its standard error.
 
-    Attributes
-    ----------
-    rate : of the flow, errors put right
-    sigma : standard error of the mean over the volume
-    """
-
-    rate: float
-    sigma: float
-
-
-def dissipation(gradient: Floats, covariance: Floats, viscosity_m2_s: float, independent: float) -> Dissipation:
-    """Return 2 nu <s_ij s_ij> of the rate of strain s.
+    Errors are put right; s is the rate of strain.
 
     Parameters
     ----------
@@ -340,7 +328,7 @@ def dissipation(gradient: Floats, covariance: Floats, viscosity_m2_s: float, ind
     sigma = float(np.sqrt(np.mean(variance) / max(independent, 1.0)))
     put_right = float(np.mean(each) + np.mean(noise))
     double = 2.0 * viscosity_m2_s
-    return Dissipation(double * put_right, double * sigma)
+    return double * put_right, double * sigma
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,10 +21,9 @@ from lfpiv_cli.files.pages import Table
 from lfpiv_cli.notice import written
 from lfpiv_cli.paper.parts import AS_PAPER, BOARD, Drawing, Findings, Row, Work, merged, sections
 from lfpiv_cli.paper.pictures import board_view, centres_figure, elongation_figure, location_figure, views_figure
-from lfpiv_cli.synthetic.board import dot_centres
 from lfpiv_cli.validation import board as of_boards
 from lfpiv_cli.verbs.simulate import placement_of
-from lfpiv_cli.verbs.validate_board import BoardBench, BoardSolver, bench_of, board_solver
+from lfpiv_cli.verbs.validate_board import BoardBench, BoardSolver, bench_of, board_in, board_solver
 
 Half = Literal["ideal", "recorded"]
 Figures = dict[str, dict[str, Any]]
@@ -143,12 +142,10 @@ class _Boards:
                 bench = bench.with_fitted_rays(self.pictures, self.depths_mm)
             self.ways[method] = bench, board_solver(bench, self.best if method == "best" else self.paper)
         (bench, solve), depth = self.ways[method], self.depths_mm[number]
-        result = solve(self.pictures[number], advance)
-        volume = bench.weights.to_world(result.volume)
-        centres = dot_centres(self.board, placement_of(self.paper, depth))[:, :2]
-        dots = of_boards.measure_dots(volume, bench.weights.grid, centres, 0.5 * self.board.spacing_mm)
+        placement = placement_of(self.paper, depth)
+        dots, volume, residual = board_in(bench, solve, self.pictures[number], placement, advance)
         view = board_view(volume, bench.weights.grid) if depth == 0.0 else None
-        return {"dots": vars(dots), "view": view, "residual": float(result.residual[-1])}
+        return {"dots": vars(dots), "view": view, "residual": residual}
 
 
 def _boards(work: Work, half: Half) -> _Boards:
@@ -189,13 +186,22 @@ def table3(work: Work, half: Half) -> Findings:
         method: of_boards.board_figures(each, boards.depths_mm, boards.board.dots, boards.board.spacing_mm)
         for method, each in dots.items()
     }
+    # by every definition: what the paper's words leave open
+    definitions = []
+    for name, definition in of_boards.DEPTH_DEFINITIONS.items():
+        found = {method: figures[method]["depth_definitions"][name] for method in METHODS}
+        errors = (f"{100.0 * each['error']:.2f}" for each in found.values())
+        words = definition.words + (" (used)" if name == of_boards.THE_PAPERS else "")
+        definitions.append((words, *errors, f"{found['ert']['shortest']:.3f} to {found['ert']['longest']:.3f}"))
+    head = ("depth of a dot", *METHODS.values(), "separations, ERT (mm)")
+    depth_errors = Table("Depth error (%) by what is taken for the depth of a dot", head, tuple(definitions))
     middle = boards.depths_mm.index(0.0)
     kept = {METHODS[method]: steps[method][middle]["view"] for method in VIEWED}
     views = {told: {name: np.array(each, np.float64) for name, each in view.items()} for told, view in kept.items()}
     return Findings(
         rows=tuple(_row(boards, measure, figures) for measure in of_boards.MEASURES),
         drawings=_drawings(boards, figures, views, dots),
-        tables=(_depth_table(figures),),
+        tables=(depth_errors,),
         text=_text(work, boards, figures),
         commands=tuple(
             f"lfpiv validate board work/{work.folder.name}/{name}.yaml -o {work.folder.name}-{name}" for name in configs
@@ -265,18 +271,6 @@ def _drawings(
             location_figure(named, boards.board.spacing_mm, steps),
         ),
     )
-
-
-def _depth_table(figures: Figures) -> Table:
-    """Return the depth error by every definition: what the paper's words leave open."""
-    rows = []
-    for name, definition in of_boards.DEPTH_DEFINITIONS.items():
-        each = {method: figures[method]["depth_definitions"][name] for method in METHODS}
-        errors = (f"{100.0 * found['error']:.2f}" for found in each.values())
-        words = definition.words + (" (used)" if name == of_boards.THE_PAPERS else "")
-        rows.append((words, *errors, f"{each['ert']['shortest']:.3f} to {each['ert']['longest']:.3f}"))
-    head = ("depth of a dot", *METHODS.values(), "separations, ERT (mm)")
-    return Table("Depth error (%) by what is taken for the depth of a dot", head, tuple(rows))
 
 
 def _where_steps(depth_mm: Floats, errors: Floats) -> str:

@@ -68,11 +68,6 @@ class ChannelSize:
         """Tracers in the volume: as dense as 8300 in the paper's, 0.002 per pixel of its sensor."""
         return round(8300 * self.length_mm * self.width_mm**2 / 1300.0)
 
-    @property
-    def window_mm(self) -> float:
-        """Side of the final interrogation window."""
-        return self.windows[-1] * VOXEL_MM
-
     def told(self) -> str:
         """Return the size in words."""
         shape = " x ".join(f"{round(side / VOXEL_MM)}" for side in self.volume_mm)
@@ -188,7 +183,7 @@ def _ways(size: ChannelSize) -> dict[str, dict[str, Any]]:
     fitted = {"board": {"dots": list(size.dots), "medium": "fluid"}, "weights": {"method": "dlfc"}}
     fine = {
         "volume": {"shape_xyz": None, "voxel_mm": None, "size_mm": size.volume_mm},
-        "correlation": {"windows": None, "window_mm": size.window_mm},
+        "correlation": {"windows": None, "window_mm": size.windows[-1] * VOXEL_MM},
     }
     return {
         "dlfc": channel_sections(size, **sart, **volumes, **fitted),

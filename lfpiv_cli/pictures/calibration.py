@@ -94,7 +94,7 @@ LENSES_ACROSS = 6.0
 
 @style.styled
 def summary_figure(calibration: Calibration) -> style.Figure:
-    """Return what a calibration tells without its pictures: residuals, transmission, and the board or the rays."""
+    """How far the lens images lie off the lattice, what pixels pass, and where the board was found."""
     figure, ((along_columns, along_rows), (passed, board)) = style.new_panels(11.0, 8.0, 2, 2)
     for axis, direction in ((along_columns, 0), (along_rows, 1)):
         draw_residual(figure, axis, calibration.fit, direction, calibration.image_shape)
@@ -117,7 +117,9 @@ def lattice_words(fit: LatticeFit) -> str:
 
 @style.styled
 def calibration_figure(calibration: Calibration, white: ArrayLike, board: ArrayLike | None = None) -> style.Figure:
-    """Return a figure with the lattice on the white image (middle and two corners), the residuals, and the board.
+    """The lattice on the white image, in the middle and in two corners.
+
+    Besides, the residuals, and the board.
 
     `white` and `board` are the raw pictures (rows, columns). Needs matplotlib.
     """

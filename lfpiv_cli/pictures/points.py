@@ -50,7 +50,7 @@ def places_px(focal_point_mm: Floats, camera: Camera, media: Media, scene: Curve
 
 @style.styled
 def places_figure(position_mm: Floats, light_counts: Floats) -> style.Figure:
-    """Return the particles from the front and from the side, coloured by their light (logarithmic)."""
+    """The particles from the front and from the side, coloured by their light."""
     from matplotlib.colors import LogNorm
 
     lit = light_counts > 0.0
@@ -67,7 +67,10 @@ def places_figure(position_mm: Floats, light_counts: Floats) -> style.Figure:
 
 @style.styled
 def image_figure(image: Floats, places: Floats, z_mm: Floats) -> style.Figure:
-    """Return a raw image in grey with the particles' places (n, 2) as (column, row), coloured by their depth."""
+    """The raw image, and where rays through the middle of the main lens (as the config has it) meet the sensor.
+
+    Places (n, 2) are (column, row).
+    """
     figure, axes = _image_canvas(image)
     axes.imshow(image, cmap="gray", vmin=0.0, vmax=_bright(image), interpolation="nearest")
     size = float(np.clip(DOTS_AREA / max(len(z_mm), 1), *DOT_SIZES))
@@ -82,7 +85,7 @@ def image_figure(image: Floats, places: Floats, z_mm: Floats) -> style.Figure:
 
 @style.styled
 def residual_figure(residual: Floats) -> style.Figure:
-    """Return what the particles leave of an image: light that none explains, red, and too much light, blue."""
+    """What the particles leave of the image: red is light that none explains, blue is too much light."""
     figure, axes = _image_canvas(residual)
     limit = _bright(residual)
     shown = axes.imshow(residual, cmap=style.DIVERGING, vmin=-limit, vmax=limit, interpolation="nearest")
@@ -107,7 +110,10 @@ def _bright(image: Floats) -> float:
 
 @style.styled
 def depths_figure(z_mm: Floats, light_counts: Floats, covariance_mm2: Floats) -> style.Figure:
-    """Return by depth: how many particles, their light (median and quartiles), and their standard deviations."""
+    """By depth: how many particles, their light, and the standard deviations of their places.
+
+    Light by its median and quartiles.
+    """
     figure = style.new_figure(11.0, 3.6)
     counts, light, sigmas = figure.subplots(1, 3)
     counts.hist(z_mm, bins=style.slab_edges(z_mm), color=style.BLUE)
@@ -123,7 +129,10 @@ def depths_figure(z_mm: Floats, light_counts: Floats, covariance_mm2: Floats) ->
 
 @style.styled
 def chi2_figure(chi2: Floats) -> style.Figure:
-    """Return chi2, about 1 where particles explain all light; what is beyond the axis is in the last bar."""
+    """How well the particles explain the light about them: chi2 is about 1 where they explain all of it.
+
+    What is beyond the axis is in the last bar.
+    """
     figure, axes = style.new_panels(6.0, 3.6)
     axes.hist(np.minimum(chi2, LARGEST_CHI2), bins=CHI2_BARS, range=(0.0, LARGEST_CHI2), color=style.BLUE)
     axes.axvline(1.0, color=style.VERMILION, linestyle="--", label="all light explained")
@@ -191,7 +200,7 @@ def space_figure(lines: list[Floats], speed_m_s: Floats, what: str) -> style.Fig
 
 @style.styled
 def velocities_figure(velocity_m_s: Floats) -> style.Figure:
-    """Return histograms of the velocity components."""
+    """The velocity components."""
     figure = style.new_figure(10.0, 3.2)
     for component, axes in enumerate(figure.subplots(1, 3)):
         axes.hist(velocity_m_s[:, component], bins=HISTOGRAM_BARS, color=style.COLOURS[component])
@@ -201,7 +210,7 @@ def velocities_figure(velocity_m_s: Floats) -> style.Figure:
 
 @style.styled
 def links_figure(link_probability: Floats) -> style.Figure:
-    """Return how probable the links are, of those whose probability is known."""
+    """How probable the links are, and how many wrong ones to expect."""
     known = link_probability[np.isfinite(link_probability)]
     figure, axes = style.new_panels(6.0, 3.6)
     axes.hist(known, bins=PROBABILITY_BARS, range=(0.0, 1.0), color=style.BLUE)
@@ -213,7 +222,7 @@ def links_figure(link_probability: Floats) -> style.Figure:
 
 @style.styled
 def sigma_figure(z_mm: Floats, sigma_m_s: Floats) -> style.Figure:
-    """Return the stated standard deviations of the velocity's components by depth (medians)."""
+    """Stated standard deviations of the velocity components by depth, medians."""
     figure, axes = style.new_panels(6.0, 3.6)
     along = {f"σ of {name}": sigma_m_s[:, k] for k, name in enumerate(style.COMPONENT_NAMES)}
     style.draw_medians(axes, z_mm, along, "standard deviation (m/s), median")
@@ -222,7 +231,7 @@ def sigma_figure(z_mm: Floats, sigma_m_s: Floats) -> style.Figure:
 
 @style.styled
 def lengths_figure(track: NDArray[np.int64]) -> style.Figure:
-    """Return how many frames the trajectories span."""
+    """How many frames the trajectories span."""
     lengths = np.unique(track, return_counts=True)[1]
     figure, axes = style.new_panels(6.0, 3.6)
     most = int(lengths.max()) if lengths.size else 1

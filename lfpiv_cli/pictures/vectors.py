@@ -166,7 +166,9 @@ def shown(field: VectorField) -> Shown:
 
 
 def planes_figure(field: VectorField) -> style.Figure:
-    """Return the vectors in the three middle planes, see `compared_figure`."""
+    """Vectors in the three middle planes. Arrows show the components in the plane, colour the one across it; both have
+    one scale in all three. Crosses are vectors that are missing.
+    """
     told = shown(field)
     return compared_figure(field.grid, {"": told.values}, told.unit)
 
@@ -214,7 +216,7 @@ def speed_unit(*velocities_m_s: Floats) -> tuple[float, str]:
 
 
 def components_figure(field: VectorField) -> style.Figure:
-    """Return maps of each component (rows) in the three middle planes, on one scale a component."""
+    """Each velocity component in the three middle planes, a row and a scale for each."""
     told = shown(field)
     each = [(name, [told.values[..., component]] * 3) for component, name in enumerate(style.COMPONENT_NAMES)]
     rows = [MapRow(maps, [name] * 3, f"{name} ({told.unit})", signed_scale(maps)) for name, maps in each]
@@ -231,9 +233,10 @@ def signed_scale(*rows: Sequence[Floats]) -> dict[str, Any]:
 
 @style.styled
 def profiles_figure(field: VectorField) -> style.Figure:
-    """Return the mean of each component (rows) over the planes across each axis (columns).
+    """Means of each component over the planes across each axis. The band is the stated standard deviation of one vector
+    to both sides.
 
-    The band is the standard deviation of one vector (rms over the plane) to both sides, where it is known.
+    The band is an rms over the plane, drawn where it is known.
     """
     told = shown(field)
     figure, axes = style.new_panels(10.0, 7.5, 3, 3, sharey="row", sharex="col")
@@ -265,7 +268,7 @@ def mean_of_known(values: Floats, axes: tuple[int, ...]) -> Floats:
 
 
 def sigma_figure(field: VectorField) -> style.Figure:
-    """Return maps of the stated standard deviation of each component (rows), on one logarithmic scale.
+    """Stated standard deviation of each component in the three middle planes, all on one logarithmic scale.
 
     Outer ones take the colours of the scale's ends.
 
@@ -291,7 +294,7 @@ def sigma_figure(field: VectorField) -> style.Figure:
 
 @style.styled
 def flags_figure(field: VectorField) -> style.Figure:
-    """Return the flags in the three middle planes, with how many vectors of the whole field have each."""
+    """Where vectors are valid, taken from a second peak, replaced by their neighbours, rejected or masked."""
     from matplotlib.colors import BoundaryNorm, ListedColormap
     from matplotlib.patches import Patch
 
@@ -318,10 +321,10 @@ def quality_figure(field: VectorField, names: dict[str, Floats]) -> style.Figure
 
 @style.styled
 def displacements_figure(field: VectorField, lens_mm: float | None = None) -> style.Figure:
-    """Return histograms of the displacements of valid vectors, and of what they are beyond whole voxels.
+    """Displacements of the valid vectors, and what they are beyond whole voxels and, where the camera is known, whole
+    microlenses: crowded about zero where they lock.
 
-    Parts that crowd about zero tell of locking. Volumes lock to whole microlenses: with their width in the scene,
-    `lens_mm`, a third row shows what displacements are beyond these.
+    Volumes lock to whole microlenses: `lens_mm` is their width in the scene.
     """
     units = {"voxels": np.ones(3)}
     if lens_mm is not None:
@@ -343,7 +346,8 @@ def displacements_figure(field: VectorField, lens_mm: float | None = None) -> st
 
 
 def gradients_figure(field: VectorField) -> style.Figure:
-    """Return the vorticity across the three middle planes, and below it the divergence, zero in a liquid, in 1/s.
+    """Vorticity across the three middle planes, and the divergence, which is zero in a liquid: what it shows is the
+    noise of gradients. One scale for both.
 
     Raises
     ------
@@ -410,7 +414,7 @@ def light_figure(z_mm: Floats, sums: Mapping[str, Floats]) -> style.Figure:
 
 @style.styled
 def projections_figure(volume: NDArray[np.float32], grid: Grid) -> style.Figure:
-    """Return the brightest voxel along each line of sight in the three directions, on one scale."""
+    """The brightest voxel along each line of sight, in the three directions, on one scale."""
     figure, axes = plane_panels(grid)
     # Along an axis that a plane is across, nothing is left but the plane.
     seen = [volume.max(axis=2 - plane.normal) for plane in PLANES]
@@ -423,7 +427,7 @@ def projections_figure(volume: NDArray[np.float32], grid: Grid) -> style.Figure:
 
 @style.styled
 def depths_figure(volume: NDArray[np.float32], grid: Grid) -> style.Figure:
-    """Return the mean intensity of each plane by depth."""
+    """The mean intensity of each plane by depth."""
     figure, axes = style.new_panels(6.0, 3.6)
     axes.plot(grid.axis_mm(2), volume.mean(axis=(1, 2), dtype=np.float64))
     axes.set(xlabel=style.DEPTH_LABEL, ylabel="mean intensity of the plane (1)", ylim=(0.0, None))

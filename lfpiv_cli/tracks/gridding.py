@@ -146,6 +146,17 @@ def kriged(
     return value, variance
 
 
+def spacing_of(points: Floats) -> float:
+    """Return the median distance of a point's nearest neighbour, mm."""
+    return float(np.median(KDTree(points).query(points, k=[2])[0]))
+
+
+def spread_around(at: Floats, points: Floats, off: Floats) -> Floats:
+    """Return how far (m, 3) the points around places are usually off, as standard deviations."""
+    near = KDTree(points).query(at, k=np.arange(1, min(TRACKS_AROUND, len(points)) + 1))[1]
+    return np.asarray(MAD_TO_SIGMA * np.median(off[near], axis=1))
+
+
 def without_own(near: NDArray[np.int64], own: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return all but one of the numbers of each row: its own, or else the last."""
     is_own = near == own[:, np.newaxis]
@@ -258,7 +269,7 @@ LARGEST_DEVIATION = 4.0
 ROUGH_EXPONENT = 1.75
 # Tracks further off what the others let expect are outliers.
 OUTLIER_SIGMAS, OUTLIER_ROUNDS = 4.0, 3
-# So many tracks around a node show how large errors are there.
+# So many tracks around a place show how large errors are there.
 TRACKS_AROUND = 40
 # Tracks that show a structure function.
 FEWEST_OF_STRUCTURE = 100
@@ -332,7 +343,7 @@ def _by_kriging(
     smallest = SMALLEST_SIGMA_SHARE * float(np.ptp(middle_mm, axis=0).max())
     noise2 = np.maximum(sigma_mm, smallest) ** 2
     structure = structure_of(middle_mm, displacement_mm, noise2)
-    apart = float(np.median(KDTree(middle_mm).query(middle_mm, k=[2])[0]))
+    apart = spacing_of(middle_mm)
     by_errors = structure.nugget + 2.0 * np.median(noise2, axis=0)
     if structure.exponent >= ROUGH_EXPONENT or np.all(structure.at(apart) < by_errors):
         return None
@@ -349,8 +360,7 @@ def _by_kriging(
         nodes_mm, np.full(len(nodes_mm), -1), middle_mm[kept], displacement_mm[kept], noise2[kept], structure
     )
     # depths are known worse in some planes than in others, whatever is stated
-    around = KDTree(middle_mm[kept]).query(nodes_mm, k=np.arange(1, min(TRACKS_AROUND, len(kept)) + 1))[1]
-    here = np.maximum(MAD_TO_SIGMA * np.median(off[around], axis=1), 1.0)
+    here = np.maximum(spread_around(nodes_mm, middle_mm[kept], off), 1.0)
     return value, np.maximum(factor, here) * np.sqrt(variance)
 
 

@@ -293,11 +293,6 @@ def pixels_per_lens(camera: Camera) -> float:
     return float(camera.micro_image_lattice_px().pitch.mean())
 
 
-def matched_f_number(magnification: float, microlens_f_number: float) -> float:
-    """Return the main lens's F_m / p_m with which lens images just touch: its cone is that of the microlenses."""
-    return microlens_f_number / (1.0 - magnification)
-
-
 def tracers_in(camera: Camera, per_lens: float, sides_mm: ArrayLike) -> float:
     """Return the tracers in a box of sides (2 or 3,) for so many in front of each microlens that looks into it."""
     width, height = np.asarray(sides_mm, dtype=np.float64)[:2] * abs(camera.magnification)
@@ -321,12 +316,6 @@ def proposed_window_mm(camera: Camera, media: Media, sides_mm: ArrayLike, overla
             share = np.where(share < 1.0, np.minimum(share * missing ** (1.0 / free), 1.0), 1.0)
     digit = 10.0 ** (np.floor(np.log10(share * sides)) - 2.0)
     return np.asarray(np.round(np.floor(share * sides / digit + ROUNDING) * digit, 9))
-
-
-def vectors_along(sides_mm: ArrayLike, window_mm: ArrayLike, overlap: ArrayLike) -> NDArray[np.int64]:
-    """Return how many vectors (3,) windows of sides in mm give along each axis of a volume."""
-    steps = np.asarray(window_mm) * (1.0 - np.asarray(overlap))
-    return np.maximum(np.floor(np.asarray(sides_mm) / steps + ROUNDING), 1.0).astype(np.int64)
 
 
 def time_step_s(velocity_m_s: float, voxel_mm: float) -> float:

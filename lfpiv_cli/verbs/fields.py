@@ -124,10 +124,10 @@ class FittedField:
             nodes = self.windows.centres.centres_mm()[known]
             covariance = gradient_covariance_at(self.field, nodes) / self.dt_s**2
             # as many parts of the volume as the splines have knots in it are independent
-            lost = vector_field.dissipation(
+            rate, error = vector_field.dissipation(
                 self.gradient(nodes), covariance, viscosity_m2_s, float(np.prod(self.field.lattice.cells))
             )
-            told |= {"dissipation_m2_s3": lost.rate, "dissipation_m2_s3_sigma": lost.sigma}
+            told |= {"dissipation_m2_s3": rate, "dissipation_m2_s3_sigma": error}
         return told
 
     def without(self) -> NDArray[np.bool_]:

@@ -20,7 +20,7 @@ from lfpiv_cli.calibration.sheet import LARGE_F_RATIO, LARGEST_F_RATIO
 from lfpiv_cli.errors import ConfigError, InputError
 from lfpiv_cli.files.config import Config
 from lfpiv_cli.files.sections import NM_TO_MM, UM_TO_MM
-from lfpiv_cli.flow.windows import WindowLayout
+from lfpiv_cli.flow.windows import ROUNDING, WindowLayout
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.notice import written
 from lfpiv_cli.optics.camera import Camera
@@ -415,7 +415,8 @@ def _better_windows(bench: Bench) -> str:
     """Return in words which windows suit volume and tracers, and why even they give few vectors if they do."""
     chosen, sides = bench.settings.correlation, bench.sides_mm
     window = planning.proposed_window_mm(bench.camera, bench.media, sides, chosen.overlap)
-    vectors = planning.vectors_along(sides, window, chosen.overlap)
+    steps = window * (1.0 - np.asarray(chosen.overlap))
+    vectors = np.maximum(np.floor(np.asarray(sides) / steps + ROUNDING), 1.0).astype(np.int64)
     told = []
     if chosen.window_mm is None or not np.allclose(chosen.window_mm, window, rtol=WINDOWS_ALIKE):
         instead = " in place of correlation.windows" if chosen.windows is not None else ""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
@@ -47,56 +48,6 @@ QUALITIES = {
 }
 
 
-# What each figure shows, in a sentence or two. Of some the reader knows more.
-OF_ALL_TRACKS = {
-    "velocities": "The velocity components.",
-    "links": "How probable the links are, and how many wrong ones to expect.",
-    "sigma": "Stated standard deviations of the velocity components by depth, medians.",
-}
-CAPTIONS: dict[str, dict[str, str]] = {
-    vtkhdf.VECTORS_FORMAT: {
-        "planes": "Vectors in the three middle planes. Arrows show the components in the plane, colour the one across "
-        "it; both have one scale in all three. Crosses are vectors that are missing.",
-        "components": "Each velocity component in the three middle planes, a row and a scale for each.",
-        "profiles": "Means of each component over the planes across each axis. The band is the stated standard "
-        "deviation of one vector to both sides.",
-        "sigma": "Stated standard deviation of each component in the three middle planes, all on one logarithmic "
-        "scale.",
-        "flags": "Where vectors are valid, taken from a second peak, replaced by their neighbours, rejected or masked.",
-        "displacements": "Displacements of the valid vectors, and what they are beyond whole voxels and, where the "
-        "camera is known, whole microlenses: crowded about zero where they lock.",
-        "gradients": "Vorticity across the three middle planes, and the divergence, which is zero in a liquid: what it "
-        "shows is the noise of gradients. One scale for both.",
-    },
-    vtkhdf.VOLUME_FORMAT: {
-        "projections": "The brightest voxel along each line of sight, in the three directions, on one scale.",
-        "depths": "The mean intensity of each plane by depth.",
-    },
-    PARTICLES_FORMAT: {
-        "places": "The particles from the front and from the side, coloured by their light.",
-        "image": "The raw image, and where rays through the middle of the main lens (as the config has it) meet the "
-        "sensor.",
-        "residual": "What the particles leave of the image: red is light that none explains, blue is too much light.",
-        "depths": "By depth: how many particles, their light, and the standard deviations of their places.",
-        "chi2": "How well the particles explain the light about them: chi2 is about 1 where they explain all of it.",
-    },
-    TRACKS_FORMAT: OF_ALL_TRACKS,
-    TRAJECTORIES_FORMAT: OF_ALL_TRACKS
-    | {
-        "space": "The trajectories in space, coloured by mean speed.",
-        "lengths": "How many frames the trajectories span.",
-    },
-    calibration_file.FORMAT: {
-        "summary": "How far the lens images lie off the lattice, what pixels pass, and where the board was found.",
-        "lattice": "The lattice on the white image, in the middle and in two corners.",
-    },
-    FORMAT: {
-        "column": "The pixels that the middle voxel lights: its point-spread function.",
-        "light": "How much of a voxel's light meets the sensor, by depth: on the axis, half-way out, and in a corner.",
-    },
-}
-
-
 @dataclass(frozen=True, eq=False)
 class Drawn:
     """A figure that can be drawn: what it shows, in a sentence or two, and the function that draws it."""
@@ -105,7 +56,7 @@ class Drawn:
     draw: Callable[[], Figure]
 
 
-# A reader's figures: what draws each, or more where the caption depends on the file.
+# A reader's figures: what draws each, whose first paragraph is the caption, or more where this depends on the file.
 Figures = dict[str, "Drawn | Callable[[], Figure]"]
 
 
@@ -183,7 +134,10 @@ def _of_trajectories(path: Path) -> Figures:
     speeds = of_points.trajectory_lines(np.linalg.norm(tracks.arrays["velocity"], axis=1), track)
     means = np.array([float(each.mean()) for each in speeds])
     figures: Figures = {
-        "space": partial(of_points.space_figure, lines, means, f"{len(lines)} trajectories"),
+        "space": Drawn(
+            "The trajectories in space, coloured by mean speed.",
+            partial(of_points.space_figure, lines, means, f"{len(lines)} trajectories"),
+        ),
         "lengths": partial(of_points.lengths_figure, track),
     }
     return figures | _of_all_tracks(tracks)
@@ -221,7 +175,8 @@ def _of_weights(path: Path) -> Figures:
     content = open_weights(path)
     nx, ny, nz = content.weights.grid.shape_xyz
     middle = partial(column_of, content, (nx // 2, ny // 2, nz // 2))
-    return {"column": middle, "light": partial(_light_of, content)}
+    column = Drawn("The pixels that the middle voxel lights: its point-spread function.", middle)
+    return {"column": column, "light": partial(_light_of, content)}
 
 
 def column_of(content: WeightsFile, voxel: tuple[int, int, int]) -> Figure:
@@ -237,6 +192,7 @@ def column_of(content: WeightsFile, voxel: tuple[int, int, int]) -> Figure:
 
 
 def _light_of(content: WeightsFile) -> Figure:
+    """How much of a voxel's light meets the sensor, by depth: on the axis, half-way out, and in a corner."""
     grid = content.reference.grid_from_focal_point(content.weights.grid)
     nx, ny, nz = grid.shape_xyz
     planes = np.unique(np.linspace(0, nz - 1, min(nz, DEPTHS)).astype(int))
@@ -294,8 +250,13 @@ def figures_of(path: Path, raw: Path | None = None) -> dict[str, Drawn]:
     if raw is not None and of_format not in ON_IMAGES:
         raise UsageError(f"--raw: figures of {of_format} show no image, only {' and '.join(ON_IMAGES)} do")
     found = ON_IMAGES[of_format](path, raw) if of_format in ON_IMAGES else READERS[of_format](path)
-    captions = CAPTIONS[of_format]
-    return {name: each if isinstance(each, Drawn) else Drawn(captions[name], each) for name, each in found.items()}
+    return {name: each if isinstance(each, Drawn) else Drawn(_caption_of(each), each) for name, each in found.items()}
+
+
+def _caption_of(draw: Callable[[], Figure]) -> str:
+    """Return what a figure shows, as the function that draws it says in its first paragraph."""
+    said = inspect.getdoc(draw.func if isinstance(draw, partial) else draw) or ""
+    return " ".join(said.split("\n\n")[0].split())
 
 
 def plot(

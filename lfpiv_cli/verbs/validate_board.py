@@ -98,6 +98,7 @@ def validate_board(
         ensure_writable(path, overwrite, [config])
     ensure_drawing()
     figures: dict[str, dict[str, Any]] = {half: {} for half in halves}
+    drawn = np.zeros(settings.grid().shape_zyx, np.float32)
     steps = len(halves) * (len(solved) * settings.reconstruction.iterations + len(chosen.methods) - len(solved))
     with console.progress(steps * len(depths), "boards") as advance:
         for half in halves:
@@ -108,7 +109,12 @@ def validate_board(
                     figures[half][method] = _discs(bench, pictures, depths, advance)
                     continue
                 judged = bench if method == "ert" else bench.with_fitted_rays(pictures, depths)
-                dots, drawn = _boards(judged, pictures, depths, settings, console, advance)
+                solve, dots = board_solver(judged, settings), []
+                for depth, picture in zip(depths, pictures, strict=True):
+                    found, volume, residual = board_in(judged, solve, picture, placement_of(settings, depth), advance)
+                    dots.append(found)
+                    drawn = volume if depth == 0.0 else drawn
+                    console.detail(f"board at {depth:+z.0f} mm: residual {residual:z.3f}")
                 measured = of_boards.board_figures(dots, depths, bench.rig.board.dots, bench.rig.board.spacing_mm)
                 figures[half][method] = measured | {"paper": of_boards.PAPER[half, method]}
                 write_picture(
@@ -190,26 +196,19 @@ def _discs(
     return of_boards.place_figures(x, z, depths_mm, rig.board.spacing_mm)
 
 
-def _boards(
+def board_in(
     bench: BoardBench,
-    pictures: Sequence[NDArray[np.float32]],
-    depths_mm: tuple[float, ...],
-    settings: Config,
-    console: Console,
+    solve: BoardSolver,
+    picture: NDArray[np.float32],
+    placement: BoardPlacement,
     advance: Callable[[int], None],
-) -> tuple[list[of_boards.DotFigures], NDArray[np.float32]]:
-    """Return what is measured of the boards in pictures at all depths, and the volume of the one in the focal plane."""
-    board = settings.rig().board
-    solve = board_solver(bench, settings)
-    dots, drawn = [], np.zeros(bench.weights.shape, np.float32)
-    for depth, picture in zip(depths_mm, pictures, strict=True):
-        result = solve(picture, advance)
-        volume = bench.weights.to_world(result.volume)
-        centres = dot_centres(board, placement_of(settings, depth))[:, :2]
-        dots.append(of_boards.measure_dots(volume, bench.weights.grid, centres, 0.5 * board.spacing_mm))
-        drawn = volume if depth == 0.0 else drawn
-        console.detail(f"board at {depth:+z.0f} mm: residual {result.residual[-1]:z.3f}")
-    return dots, drawn
+) -> tuple[of_boards.DotFigures, NDArray[np.float32], float]:
+    """Return what is measured of the board in a picture, its volume [z, y, x], and the solver's last residual."""
+    board, result = bench.rig.board, solve(picture, advance)
+    volume = bench.weights.to_world(result.volume)
+    centres = dot_centres(board, placement)[:, :2]
+    dots = of_boards.measure_dots(volume, bench.weights.grid, centres, 0.5 * board.spacing_mm)
+    return dots, volume, float(result.residual[-1])
 
 
 def board_solver(bench: BoardBench, settings: Config) -> BoardSolver:
