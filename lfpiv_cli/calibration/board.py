@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from lfpiv_cli.arrays import Floats
+from lfpiv_cli.arrays import Floats, Singles
 from lfpiv_cli.calibration.board_pose import BoardGeometry, BoardPose, on_the_grid, pose_of_dots
 from lfpiv_cli.calibration.corners import Look, enlarged_view, evenly_lit, first_corners
 from lfpiv_cli.calibration.shape_fit import PointShape, covered_shares
@@ -169,9 +169,7 @@ def disc_shape(radius_mm: float) -> PointShape:
     return PointShape(radius_mm, radius_mm, covered_shares, radius_mm, partial(disc_strips, radius_mm))
 
 
-def dots_look(
-    image: NDArray[np.float32], passed: NDArray[np.float32], camera: Camera, board: BoardGeometry, media: Media
-) -> DotLook:
+def dots_look(image: Singles, passed: Singles, camera: Camera, board: BoardGeometry, media: Media) -> DotLook:
     """Find the dots of a board; errors are those of `locate_board`."""
     radius = 0.5 * board.dot_diameter_mm
     seen, pitch = abs(camera.magnification) * radius, float(camera.lattice.pitch.min())
@@ -185,12 +183,12 @@ def dots_look(
 
 
 def locate_board(
-    image: NDArray[np.float32],
+    image: Singles,
     camera: Camera,
     board: BoardGeometry,
     media: Media,
     rotation_rad: float = 0.0,
-    transmission: NDArray[np.float32] | None = None,
+    transmission: Singles | None = None,
     light: WaveLight | None = None,
 ) -> BoardPose:
     """Find the dots of a board in depth by fitting each one's rendering, and the board through them.
@@ -243,7 +241,7 @@ def locate_board(
 
 
 def dots_in_world(
-    image: NDArray[np.float32], camera: Camera, board: BoardGeometry, media: Media, rotation_rad: float = 0.0
+    image: Singles, camera: Camera, board: BoardGeometry, media: Media, rotation_rad: float = 0.0
 ) -> Floats:
     """Return where the camera, believed as it is, sees each dot: (dots along y, dots along x, 3); NaN where none is.
 
@@ -257,7 +255,7 @@ def dots_in_world(
     return dots
 
 
-def dot_signal(image: NDArray[np.float32], passed: NDArray[np.float32], board: BoardGeometry) -> Floats:
+def dot_signal(image: Singles, passed: Singles, board: BoardGeometry) -> Floats:
     """Return the picture with the dots bright on a dim ground; dark dots are what the lit board lacks of full light.
 
     Dots cover the smaller part of a board: where the polarity is not known, most of the picture is the board.

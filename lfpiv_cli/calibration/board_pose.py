@@ -10,9 +10,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from lfpiv_cli.arrays import Floats
+from lfpiv_cli.arrays import Flags, Floats, Integers
 from lfpiv_cli.calibration.white import first_of_each
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.names import Medium, Pattern, Polarity
@@ -53,7 +52,7 @@ class FlatFit:
     k1_sigma_per_mm2: float | None = None
 
 
-def flat_fit(dots_mm: Floats, indices: NDArray[np.int64], board: BoardGeometry, radius_mm: Floats | None) -> FlatFit:
+def flat_fit(dots_mm: Floats, indices: Integers, board: BoardGeometry, radius_mm: Floats | None) -> FlatFit:
     """Fit a flat regular board, and the distortion where the dots can tell it from the magnification.
 
     Parameters
@@ -185,7 +184,7 @@ class BoardPose:
     ..._sigma... : standard errors
     """
 
-    indices: NDArray[np.int64]
+    indices: Integers
     dots_mm: Floats
     dots_sigma_mm: Floats
     residual_mm: Floats
@@ -222,7 +221,7 @@ def pose_of_dots(
     array_mm: Floats,
     camera: Camera,
     board: BoardGeometry,
-    numbers: NDArray[np.int64] | None = None,
+    numbers: Integers | None = None,
 ) -> BoardPose:
     """Fit a flat regular board to dots or corners.
 
@@ -282,7 +281,7 @@ def lens_in_scene_mm(camera: Camera) -> tuple[float, float]:
     return lens, lens / camera.aperture_radius_mm * camera.focus_distance_mm
 
 
-def on_the_grid(dots_mm: Floats, board: BoardGeometry) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def on_the_grid(dots_mm: Floats, board: BoardGeometry) -> tuple[Integers, Integers]:
     """Return which dots belong to the board (m,) and their indices on it (m, 2); dots may be missing."""
     refuse_few(len(dots_mm), board)
     lateral = dots_mm[:, :2]
@@ -307,7 +306,7 @@ def on_the_grid(dots_mm: Floats, board: BoardGeometry) -> tuple[NDArray[np.int64
     return kept[within], indices[within] - corner
 
 
-def numbered_dots(lateral: Floats, start: int, spacing_mm: float) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+def numbered_dots(lateral: Floats, start: int, spacing_mm: float) -> tuple[Integers, Flags]:
     """Number the dots by a grid through one of them, which grows outward and adapts: (n, 2), and which are on it (n,).
 
     Missing dots leave gaps that a walk from neighbour to neighbour could not cross.
@@ -380,9 +379,7 @@ def refuse_scattered(fit: FlatFit, board: BoardGeometry, camera: Camera) -> None
         )
 
 
-def upright_numbers(
-    numbers: NDArray[np.int64], lateral_mm: Floats, board: BoardGeometry
-) -> tuple[NDArray[np.int64], BoardGeometry]:
+def upright_numbers(numbers: Integers, lateral_mm: Floats, board: BoardGeometry) -> tuple[Integers, BoardGeometry]:
     """Return numbers (n, 2) of a board's points that grow with x and y, and the board as it is then seen."""
     terms = np.column_stack([np.ones(len(numbers)), numbers])
     along = np.linalg.lstsq(terms, lateral_mm, rcond=None)[0][1:]
@@ -393,7 +390,7 @@ def upright_numbers(
     return np.where(np.diag(along) < 0.0, last - numbers, numbers), board
 
 
-def best_window(indices: NDArray[np.int64], dots: tuple[int, int]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+def best_window(indices: Integers, dots: tuple[int, int]) -> tuple[Integers, Flags]:
     """Return the first index (2,) of the window of so many dots that holds most, and which (n,) these are.
 
     Of windows that hold as many it is the most central one: the dots' mean index is nearest the window's middle, so

@@ -18,7 +18,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from lfpiv_cli.arrays import Floats
+from lfpiv_cli.arrays import Floats, Integers, Singles
 from lfpiv_cli.calibration.board_pose import BoardGeometry
 from lfpiv_cli.calibration.rectification import turned
 from lfpiv_cli.calibration.shape_fit import PointShape, ShapeFit, fit_shape, pixels_near, scene_points, scene_shares
@@ -156,7 +156,7 @@ class Look(ABC):
     """
 
     signal: Floats
-    passed: NDArray[np.float32]
+    passed: Singles
     medium: Media
 
     # More pixels than these make a fit slower and hardly better: the model's own errors are larger than their noise.
@@ -167,7 +167,7 @@ class Look(ABC):
         return self
 
     @abstractmethod
-    def begun(self, camera: Camera, board: BoardGeometry) -> tuple[Floats, NDArray[np.int64] | None, PointShape]:
+    def begun(self, camera: Camera, board: BoardGeometry) -> tuple[Floats, Integers | None, PointShape]:
         """Return first guesses (n, 3) of the points, image axes, their numbers (n, 2) if known, and what lies there."""
 
     @abstractmethod
@@ -176,7 +176,7 @@ class Look(ABC):
 
     def measured(
         self, camera: Camera, board: BoardGeometry, rotation_rad: float, by: WaveLight | None = None
-    ) -> tuple[Floats, Floats, NDArray[np.int64] | None]:
+    ) -> tuple[Floats, Floats, Integers | None]:
         """Return where points are, fitted to what pixels see about them by rays, and from there by waves.
 
         That is places and standard errors (n, 3), turned back to the raw sensor's axes, and numbers (n, 2) of the
@@ -226,12 +226,12 @@ class CornerLook(Look):
     sample : (n, 2) where, in samples (column, row) of the upright view
     """
 
-    numbers: NDArray[np.int64]
+    numbers: Integers
     sample: Floats
 
     most_pixels = 4_000
 
-    def begun(self, camera: Camera, board: BoardGeometry) -> tuple[Floats, NDArray[np.int64], PointShape]:
+    def begun(self, camera: Camera, board: BoardGeometry) -> tuple[Floats, Integers, PointShape]:
         """Return where the corners' lines x_m = alpha X - x s_i/s_o have them."""
         lines, s_i = straight_lines(*self.sightings(camera, board), camera), camera.image_distance_mm
         distance = s_i / (lines[:, 2] - 1.0 + s_i / camera.focal_length_mm)
@@ -316,7 +316,7 @@ def upright_view(image: Floats, camera: Camera, grid: ViewGrid, crossing_mm: Flo
     return np.stack([np.interp(at, lenses[:, 0], row) for lenses, row in zip(grid.lenses_mm, view, strict=True)])
 
 
-def refined(picture: NDArray[np.float32], guess: Floats, half: tuple[int, ...]) -> Floats:
+def refined(picture: Singles, guess: Floats, half: tuple[int, ...]) -> Floats:
     """Return corners (n, 2) to a fraction of a sample, NaN where the window leaves the picture or the corner it."""
     rows, columns = picture.shape
     margin = np.array(half) + 1.0
@@ -370,9 +370,7 @@ def straight_lines(crossing_mm: Floats, seen_mm: Floats, camera: Camera) -> Floa
     return lines
 
 
-def first_corners(
-    image: NDArray[np.float32], passed: NDArray[np.float32], camera: Camera, board: BoardGeometry, media: Media
-) -> CornerLook:
+def first_corners(image: Singles, passed: Singles, camera: Camera, board: BoardGeometry, media: Media) -> CornerLook:
     """Find the corners of a chessboard or ChArUco board in the view from the main lens's middle.
 
     Raises
@@ -403,7 +401,7 @@ def first_corners(
     return CornerLook(image.astype(np.float64), passed, media, numbers, (place + 0.5) / scale - 0.5)
 
 
-def evenly_lit(image: NDArray[np.floating], passed: NDArray[np.float32]) -> Floats:
+def evenly_lit(image: NDArray[np.floating], passed: Singles) -> Floats:
     """Return a picture (rows, columns) divided by the share of light that pixels pass, 0 where it is unusable."""
     usable = passed > 0.0
     return np.where(usable, image.astype(np.float64) / np.where(usable, passed, 1.0), 0.0)

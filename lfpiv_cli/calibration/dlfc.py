@@ -18,9 +18,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from lfpiv_cli.arrays import Floats
+from lfpiv_cli.arrays import Flags, Floats, Integers, Singles
 from lfpiv_cli.calibration.board import dot_signal, first_dots
 from lfpiv_cli.calibration.board_pose import BoardGeometry, on_the_grid
 from lfpiv_cli.calibration.corners import evenly_lit
@@ -48,7 +48,7 @@ FEWEST_BOARDS = 3
 COMMON_SHARE = 1e-4
 
 
-def shown(z_mm: float, plate_mm: Floats, dot: NDArray[np.int64], crossing_mm: Floats, array_mm: Floats) -> Floats:
+def shown(z_mm: float, plate_mm: Floats, dot: Integers, crossing_mm: Floats, array_mm: Floats) -> Floats:
     """Return depth, alpha, beta and its error (4,) of x_m = alpha X - beta x, fitted to what was seen of a board.
 
     The board is turned and placed as it is. Alpha is by how much its picture on the array moves per length between
@@ -162,7 +162,7 @@ class RayFit:
 class Sightings(NamedTuple):
     """A board's dots in views: which dot (n,), crossings (n, 2) of the main lens, places (n, 2) on the array."""
 
-    dot: NDArray[np.int64]
+    dot: Integers
     crossing_mm: Floats
     array_mm: Floats
 
@@ -185,7 +185,7 @@ class SeenBoard:
     alpha: float
     forward: float
     place_mm: Floats
-    index: NDArray[np.int64]
+    index: Integers
 
 
 def fit_rays(
@@ -194,7 +194,7 @@ def fit_rays(
     camera: Camera,
     board: BoardGeometry,
     media: Media,
-    transmission: NDArray[np.float32] | None = None,
+    transmission: Singles | None = None,
 ) -> RayFit:
     """Fit the polynomials to pictures of a board at several depths.
 
@@ -230,7 +230,7 @@ def _fit_as_seen_by(
     depths_mm: Sequence[float],
     board: BoardGeometry,
     media: Media,
-    transmission: NDArray[np.float32] | None,
+    transmission: Singles | None,
 ) -> RayFit:
     """Fit the polynomials with a camera believed as it is; parameters and errors are those of `fit_rays`."""
     depths = np.asarray(depths_mm, dtype=np.float64)
@@ -278,7 +278,7 @@ def _fit_as_seen_by(
 
 
 def seen_board(
-    image: ArrayLike, z_mm: float, camera: Camera, board: BoardGeometry, media: Media, passed: NDArray[np.float32]
+    image: ArrayLike, z_mm: float, camera: Camera, board: BoardGeometry, media: Media, passed: Singles
 ) -> SeenBoard:
     """Find and number the dots of one board in the picture refocused to where they are sharpest."""
     signal = dot_signal(np.asarray(image, dtype=np.float32), passed, board)
@@ -304,7 +304,7 @@ def aligned(boards: list[SeenBoard], board: BoardGeometry) -> list[SeenBoard]:
     return result
 
 
-def _plate(index: NDArray[np.int64], board: BoardGeometry) -> Floats:
+def _plate(index: Integers, board: BoardGeometry) -> Floats:
     """Return places (..., 2) about the board's middle of dots given by their numbers."""
     return board.spacing_mm * (index - (np.array(board.dots) - 1) / 2)
 
@@ -389,7 +389,7 @@ def dot_centroids(view: Floats, lenses: Floats, guess: Floats, window: float, re
 
 def polynomial_fit(
     start_mm: Floats, crossing_mm: Floats, array_mm: Floats, degree: int, camera: Camera
-) -> tuple[PolynomialRays, Floats, NDArray[np.bool_]]:
+) -> tuple[PolynomialRays, Floats, Flags]:
     """Return the complete polynomials through rays from (n, 3) through (n, 2) to (n, 2), and how well they fit.
 
     That is the misfit (n, 2) in mm, and which rays were used (n,).

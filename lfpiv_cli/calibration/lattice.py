@@ -9,11 +9,11 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy import fft, ndimage
 from scipy.special import fdtrc
 
-from lfpiv_cli.arrays import Floats
+from lfpiv_cli.arrays import Floats, Integers
 from lfpiv_cli.calibration.white import (
     NARROWEST_LENS_IMAGE,
     checked_white,
@@ -125,9 +125,7 @@ def rotated(vector: Floats, angle_rad: float) -> Floats:
     return np.array([cosine * vector[0] - sine * vector[1], sine * vector[0] + cosine * vector[1]])
 
 
-def bins_around(
-    power: Floats, step: Floats, line: Floats, reach: int
-) -> tuple[Floats, NDArray[np.int64], NDArray[np.int64]]:
+def bins_around(power: Floats, step: Floats, line: Floats, reach: int) -> tuple[Floats, Integers, Integers]:
     """Return the power near a frequency and its column and row bin numbers; the half-plane is mirrored where needed."""
     column, row = np.rint(line / step).astype(np.int64)
     columns = np.arange(column - reach, column + reach + 1)[np.newaxis, :]
@@ -183,7 +181,7 @@ class LatticeFit:
     """
 
     lattice_px: Lattice
-    indices: NDArray[np.int64]
+    indices: Integers
     centres_px: Floats
     cubic_px: Floats
     cubic_used: bool
@@ -302,7 +300,7 @@ def robust_fit(terms: Floats, points: Floats) -> tuple[Floats, Floats]:
     return coefficients, weights
 
 
-def without_strays(indices: NDArray[np.int64], points: Floats, pitch_px: float) -> tuple[NDArray[np.int64], Floats]:
+def without_strays(indices: Integers, points: Floats, pitch_px: float) -> tuple[Integers, Floats]:
     """Drop the spots that lie more than a quarter of the pitch off the cubic: dirt between the lenses."""
     terms = polynomial_terms(indices)
     coefficients, _ = robust_fit(terms, points)
@@ -310,7 +308,7 @@ def without_strays(indices: NDArray[np.int64], points: Floats, pitch_px: float) 
     return indices[kept], points[kept]
 
 
-def lattice_through(indices: NDArray[np.int64], points: Floats, centre: Floats, layout: Layout) -> LatticeFit:
+def lattice_through(indices: Integers, points: Floats, centre: Floats, layout: Layout) -> LatticeFit:
     """Fit the plain lattice and the cubic to numbered lens images and judge whether the cubic is worth it."""
     first, _ = robust_fit(polynomial_terms(indices, 3), points)
     indices = indices - Lattice(first[0], first[1:3], layout).nearest(centre)

@@ -20,7 +20,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from lfpiv_cli.arrays import Floats
+from lfpiv_cli.arrays import Floats, Integers, Singles
 from lfpiv_cli.calibration.lattice import LatticeFit
 from lfpiv_cli.calibration.rectification import Rectification
 from lfpiv_cli.optics.camera import Lattice
@@ -121,12 +121,10 @@ class LensImages:
     cells: Cells
     area: Floats
     pattern: Floats
-    between: NDArray[np.int64]
+    between: Integers
 
     @classmethod
-    def of(
-        cls, rectification: Rectification, transmission: NDArray[np.float32] | None, lens_image_width: float
-    ) -> LensImages:
+    def of(cls, rectification: Rectification, transmission: Singles | None, lens_image_width: float) -> LensImages:
         """Return the lens images of a calibration: by its transmission, or discs of a width in pitches without one."""
         lattice, shape = rectification.fit.lattice_px, rectification.image_shape
         cells = Cells.of(lattice, shape, rectification.fit)
@@ -242,9 +240,7 @@ def folded(picture: NDArray[np.floating], level: float, cells: Cells, bins: int)
 
 
 @njit(cache=True, nogil=True)
-def fold_strips(
-    strips: tuple[int, int], picture: NDArray[np.float32], level: float, cells: Cells, total: Floats
-) -> None:
+def fold_strips(strips: tuple[int, int], picture: Singles, level: float, cells: Cells, total: Floats) -> None:
     """Add the light of strips of parts to `total`; a pixel's is shared by the four bins around it."""
     (rows, columns), bins = picture.shape, total.shape[1] - 2
     inverse = cells.inverse_basis

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter
 from scipy.spatial import KDTree
 
-from lfpiv_cli.arrays import Floats
+from lfpiv_cli.arrays import Flags, Floats
 from lfpiv_cli.calibration.board_pose import COMMON_SHARE_OF_LENS_DEPTH, BoardPose
 from lfpiv_cli.calibration.lattice import LatticeFit
 from lfpiv_cli.calibration.lens_light import LensImages, cell_places, part_middles
@@ -327,9 +327,7 @@ def level_notices(images: LensImages, picture: NDArray[np.floating], name: str) 
     return [Notice("dark-level", name, text, remedy, level, f"within {written(largest, 2)} counts")]
 
 
-def saturated_share(
-    picture: NDArray[np.floating], too_bright: NDArray[np.bool_], background: tuple[float, float]
-) -> float:
+def saturated_share(picture: NDArray[np.floating], too_bright: Flags, background: tuple[float, float]) -> float:
     """Return which share of the lit pixels of a picture (rows, columns) is saturated.
 
     Parameters

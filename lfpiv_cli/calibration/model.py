@@ -10,10 +10,10 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from threadpoolctl import threadpool_limits
 
-from lfpiv_cli.arrays import Floats
+from lfpiv_cli.arrays import Floats, Singles
 from lfpiv_cli.calibration.board import locate_board
 from lfpiv_cli.calibration.board_pose import BoardGeometry, BoardPose
 from lfpiv_cli.calibration.dlfc import RayFit, fit_rays
@@ -105,7 +105,7 @@ class Calibration:
     """
 
     rectification: Rectification
-    transmission: NDArray[np.float32] | None = None
+    transmission: Singles | None = None
     pose: BoardPose | None = None
     camera_move_mm: float | None = None
     mid_plane_z_mm: float | None = None

@@ -12,10 +12,10 @@ from functools import cached_property
 
 import numpy as np
 from numba import njit
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy import ndimage
 
-from lfpiv_cli.arrays import Floats
+from lfpiv_cli.arrays import Flags, Floats, Integers, Singles
 from lfpiv_cli.calibration.lattice import EXPONENTS, LatticeFit
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.names import ColumnAxis
@@ -56,7 +56,7 @@ class Rectification:
         return Lattice(origin, np.array([[along, 0.0], [side, height]]), raw.layout)
 
     @cached_property
-    def shift_px(self) -> NDArray[np.float32]:
+    def shift_px(self) -> Singles:
         """Where each rectified pixel is found in the raw image, less its own place: (rows, columns, 2), column first.
 
         Float32 holds these few pixels to 1e-6 px at half the memory.
@@ -68,14 +68,14 @@ class Rectification:
         return shift
 
     @cached_property
-    def inside(self) -> NDArray[np.bool_]:
+    def inside(self) -> Flags:
         """Rectified pixels (rows, columns) whose place in the raw image lies between the centres of its pixels."""
         rows, columns = self.image_shape
         column = np.arange(columns) + self.shift_px[..., 0]
         row = np.arange(rows)[:, np.newaxis] + self.shift_px[..., 1]
         return (column >= 0.0) & (column <= columns - 1) & (row >= 0.0) & (row <= rows - 1)
 
-    def apply(self, image: ArrayLike) -> NDArray[np.float32]:
+    def apply(self, image: ArrayLike) -> Singles:
         """Return the rectified image, same shape, by cubic splines; 0 outside the sensor.
 
         Raises
@@ -114,12 +114,7 @@ def turned(points: ArrayLike, angle_rad: float) -> Floats:
 
 @njit(cache=True, nogil=True)
 def write_shift(
-    part: tuple[int, int],
-    origin: Floats,
-    basis: Floats,
-    model: tuple[Floats, NDArray[np.int64]],
-    turn: Floats,
-    shift: NDArray[np.float32],
+    part: tuple[int, int], origin: Floats, basis: Floats, model: tuple[Floats, Integers], turn: Floats, shift: Singles
 ) -> None:
     """Write for each rectified pixel of rows `part` its raw place less its own (rows, columns, 2).
 
@@ -153,13 +148,7 @@ def mirrored(index: int, size: int) -> int:
 
 
 @njit(cache=True, nogil=True)
-def sample_rows(
-    part: tuple[int, int],
-    coefficients: Floats,
-    shift: NDArray[np.float32],
-    inside: NDArray[np.bool_],
-    image: NDArray[np.float32],
-) -> None:
+def sample_rows(part: tuple[int, int], coefficients: Floats, shift: Singles, inside: Flags, image: Singles) -> None:
     """Write rows `part` of a cubic spline at each pixel's place plus its shift, where inside."""
     rows, columns = coefficients.shape
     for row in range(part[0], part[1]):

@@ -16,9 +16,8 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
-from lfpiv_cli.arrays import Floats
+from lfpiv_cli.arrays import Floats, Integers, Singles
 from lfpiv_cli.optics.camera import Camera, Lattice, nearest_point, undistorted
 from lfpiv_cli.optics.media import Media, equivalent_object_distance
 
@@ -158,7 +157,7 @@ class PixelRays(NamedTuple):
     ideal_mm: Floats
 
 
-def pixel_rays(camera: Camera, column: NDArray[np.int64], row: NDArray[np.int64]) -> PixelRays:
+def pixel_rays(camera: Camera, column: Integers, row: Integers) -> PixelRays:
     """Return the rays of pixels: the microlens of a pixel is that of the nearest micro-image."""
     px = np.stack([column, row], axis=-1).astype(np.float64)
     micro_images = camera.micro_image_lattice_px()
@@ -343,12 +342,7 @@ class NearPixels(NamedTuple):
 
 
 def pixels_near(
-    picture: tuple[Floats, NDArray[np.float32]],
-    camera: Camera,
-    media: Media,
-    start_mm: Floats,
-    reach_mm: float,
-    most: int,
+    picture: tuple[Floats, Singles], camera: Camera, media: Media, start_mm: Floats, reach_mm: float, most: int
 ) -> NearPixels | None:
     """Return the pixels that see the plane of a point within `reach_mm` of it; None where the sensor holds too few.
 

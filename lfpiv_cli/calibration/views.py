@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
-from lfpiv_cli.arrays import Floats
+from lfpiv_cli.arrays import Floats, Integers
 from lfpiv_cli.calibration.board_pose import BoardGeometry
 from lfpiv_cli.calibration.shape_fit import lens_crossings, pixel_rays, scene_points
 from lfpiv_cli.optics.camera import Camera
@@ -26,7 +26,7 @@ from lfpiv_cli.optics.media import Media
 LEAST_CONTRAST = 60.0
 
 
-def chessboard_corners(picture: NDArray[np.uint8], board: BoardGeometry) -> tuple[NDArray[np.int64], Floats] | None:
+def chessboard_corners(picture: NDArray[np.uint8], board: BoardGeometry) -> tuple[Integers, Floats] | None:
     """Return numbers and places (n, 2) of all inner corners of a chessboard; None where it is not wholly there."""
     # CALIB_CB_NORMALIZE_IMAGE would equalise the histogram, which draws corners of small boards off by a square
     flags = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY
@@ -56,12 +56,12 @@ def alternating(picture: NDArray[np.uint8], corners: Floats) -> bool:
     return bool(apart > LEAST_CONTRAST)
 
 
-def board_numbers(board: BoardGeometry) -> NDArray[np.int64]:
+def board_numbers(board: BoardGeometry) -> Integers:
     """Return the numbers (n, 2) of all corners along the board's columns and rows, row by row."""
     return np.stack(np.meshgrid(*(np.arange(n) for n in board.dots)), axis=-1).reshape(-1, 2).astype(np.int64)
 
 
-def charuco_corners(picture: NDArray[np.uint8], board: BoardGeometry) -> tuple[NDArray[np.int64], Floats] | None:
+def charuco_corners(picture: NDArray[np.uint8], board: BoardGeometry) -> tuple[Integers, Floats] | None:
     """Return numbers and places (n, 2) of the inner corners of a ChArUco board that are seen; None where none is."""
     settings = cv2.aruco.CharucoParameters()
     settings.minMarkers = 1  # of the two beside a corner: at the picture's edge one is cut
@@ -110,7 +110,7 @@ def described(board: BoardGeometry) -> str:
 def refocusing(
     camera: Camera,
     media: Media,
-    pixels: tuple[NDArray[np.int64], NDArray[np.int64]],
+    pixels: tuple[Integers, Integers],
     samples_per_lens: int,
     half_width: float,
     smoothing: float,
@@ -155,7 +155,7 @@ REFOCUS_SMOOTHING = 0.5
 LEAST_SEEN = 0.1
 
 
-def lens_table(camera: Camera) -> NDArray[np.int64]:
+def lens_table(camera: Camera) -> Integers:
     """Return the lattice indices (rows, columns, 2) of the lenses whose images are centred on the sensor.
 
     The table is rectangular: on hexagons, whose second vector leans, each row starts where the leaning has led it.

@@ -15,9 +15,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
-from lfpiv_cli.arrays import Floats
+from lfpiv_cli.arrays import Floats, Integers
 from lfpiv_cli.calibration.shape_fit import PixelRays, SharesAndSlopes, Strips
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.line_responses import PHASES, LineResponses, line_responses, on_pixels, spline_weights
@@ -130,7 +129,7 @@ class WaveShapes:
         filled = (along * lines.signs) @ across.T
         return np.asarray((light / filled)[of_column, of_row])
 
-    def _lines_of(self, rays: PixelRays, spot_mm: Floats, axis: int) -> tuple[NDArray[np.int64], Floats, Floats]:
+    def _lines_of(self, rays: PixelRays, spot_mm: Floats, axis: int) -> tuple[Integers, Floats, Floats]:
         """Return the column or row of each pixel (n,), and of each of these where spot (m, 1) and pixels (m,) lie.
 
         The spot from the lens, mm, and the pixels from the middle of the lens image. Distortion moves the lenses of one

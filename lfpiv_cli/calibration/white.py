@@ -10,11 +10,11 @@ from itertools import pairwise
 
 import numpy as np
 from numba import njit
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from lfpiv_cli.arrays import Floats
+from lfpiv_cli.arrays import Flags, Floats, Integers, Singles
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.neighbourhoods import largest_around, smallest_around
 from lfpiv_cli.optics.camera import Lattice
@@ -60,7 +60,7 @@ def find_spots(image: Floats, pitch_px: float) -> Floats:
 @njit(cache=True)
 def spot_centroids(
     image: Floats, start: Floats, base: Floats, height: Floats, radius_px: float
-) -> tuple[Floats, NDArray[np.bool_]]:
+) -> tuple[Floats, Flags]:
     """Return clipped centroids (n, 2) in a disc that follows them, and whether each converged inside the image."""
     rows, columns = image.shape
     centres = start.copy()
@@ -96,7 +96,7 @@ def spot_centroids(
     return centres, good
 
 
-def index_spots(points: Floats, start: int, basis: Floats) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+def index_spots(points: Floats, start: int, basis: Floats) -> tuple[Integers, Flags]:
     """Number the points by walking outward over a lattice whose vectors may change slowly on the way.
 
     Parameters
@@ -136,7 +136,7 @@ def index_spots(points: Floats, start: int, basis: Floats) -> tuple[NDArray[np.i
     return indices, reached & first_of_each(indices, reached)
 
 
-def first_of_each(indices: NDArray[np.int64], chosen: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def first_of_each(indices: Integers, chosen: Flags) -> Flags:
     """Return the mask (n,) of the first chosen point of each index."""
     where = np.nonzero(chosen)[0]
     _, first = np.unique(indices[where], axis=0, return_index=True)
@@ -165,7 +165,7 @@ NARROWEST_LENS_IMAGE = 0.6
 FEWEST_MIDDLES = 20
 
 
-def relative_transmission(white: NDArray[np.float32], lattice_px: Lattice) -> NDArray[np.float32]:
+def relative_transmission(white: Singles, lattice_px: Lattice) -> Singles:
     """Return the share (rows, columns) of the centre's light that each pixel passes; 0 where it cannot be used.
 
     Parameters
@@ -180,7 +180,7 @@ def relative_transmission(white: NDArray[np.float32], lattice_px: Lattice) -> ND
     return np.where(relative >= TRANSMISSION_FLOOR, relative, np.float32(0.0))
 
 
-def lens_image_width(white: NDArray[np.float32], lattice_px: Lattice) -> float:
+def lens_image_width(white: Singles, lattice_px: Lattice) -> float:
     """Return how wide lens images are over their pitch, around the sensor's centre: the diameter of a disc as large.
 
     As large as what is at least half as bright as the brightest pixel of a lens image, in the middle one of them all.
@@ -194,7 +194,7 @@ def lens_image_width(white: NDArray[np.float32], lattice_px: Lattice) -> float:
     return float(np.sqrt(4.0 / np.pi * area) / lattice_px.pitch.mean())
 
 
-def fit_vignetting(transmission: NDArray[np.float32], lattice_px: Lattice) -> Floats | None:
+def fit_vignetting(transmission: Singles, lattice_px: Lattice) -> Floats | None:
     """Return what of the transmission varies slowly over the lenses, as coefficients [y power, x power]; see below.
 
     Only the middles of the lens images are used: their rims show the aperture, which the weights hold already. None
@@ -236,7 +236,7 @@ def fit_vignetting(transmission: NDArray[np.float32], lattice_px: Lattice) -> Fl
     return coefficients
 
 
-def vignetting_surface(coefficients: Floats, shape: tuple[int, int]) -> NDArray[np.float32]:
+def vignetting_surface(coefficients: Floats, shape: tuple[int, int]) -> Singles:
     """Return the share (rows, columns) of the middle's light that passes: a polynomial in the place over the sensor.
 
     x and y run from -1 to 1 over the columns and the rows.
@@ -246,9 +246,7 @@ def vignetting_surface(coefficients: Floats, shape: tuple[int, int]) -> NDArray[
     return np.clip(surface, TRANSMISSION_FLOOR, 1.0 / TRANSMISSION_FLOOR).astype(np.float32)
 
 
-def _middle_part(
-    white: NDArray[np.float32], lattice_px: Lattice
-) -> tuple[NDArray[np.float32], Floats, NDArray[np.int64]]:
+def _middle_part(white: Singles, lattice_px: Lattice) -> tuple[Singles, Floats, Integers]:
     """Return the square around the sensor's centre, its pixels' places (..., 2) as (column, row), and their lenses."""
     rows, columns = white.shape
     top, left = max(0, (rows - MIDDLE_SIDE_PX) // 2), max(0, (columns - MIDDLE_SIDE_PX) // 2)

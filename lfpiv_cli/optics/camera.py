@@ -13,9 +13,9 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import njit
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from lfpiv_cli.arrays import Floats
+from lfpiv_cli.arrays import Floats, Integers
 from lfpiv_cli.names import ColumnAxis, Layout
 from lfpiv_cli.optics.media import Media
 from lfpiv_cli.scale import Scale
@@ -77,7 +77,7 @@ class Lattice:
         """Return the fractional indices of positions, shape (..., 2)."""
         return (np.asarray(points, dtype=np.float64) - self.origin) @ np.linalg.inv(self.basis)
 
-    def nearest(self, points: ArrayLike) -> NDArray[np.int64]:
+    def nearest(self, points: ArrayLike) -> Integers:
         """Return the indices of the lattice point nearest to each position, shape (..., 2).
 
         Rounding the oblique coordinates is right on squares and names the wrong neighbour for one point in six on

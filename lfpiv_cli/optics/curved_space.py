@@ -29,9 +29,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from lfpiv_cli.arrays import Floats
+from lfpiv_cli.arrays import Flags, Floats
 from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media
@@ -144,13 +144,13 @@ class CurvedSpace:
         """
         return camera.focus_distance_mm + self.media.depth_ratio * np.asarray(z_mm, dtype=np.float64)
 
-    def slopes(self, camera: Camera, points_mm: ArrayLike, crossing_mm: ArrayLike) -> tuple[Floats, NDArray[np.bool_]]:
+    def slopes(self, camera: Camera, points_mm: ArrayLike, crossing_mm: ArrayLike) -> tuple[Floats, Flags]:
         """Return the slopes (n, 2) at the lens of the rays from points (n, 3) that cross it at (n, 2), if they do."""
         crossing = _rows(crossing_mm, 2)
         points = np.ascontiguousarray(np.broadcast_to(_rows(points_mm, 3), (len(crossing), 3)))
         return aim_all(self.for_kernels(camera), points, crossing)
 
-    def equivalent(self, camera: Camera, points_mm: ArrayLike) -> tuple[Floats, Floats, NDArray[np.bool_]]:
+    def equivalent(self, camera: Camera, points_mm: ArrayLike) -> tuple[Floats, Floats, Flags]:
         """Return where points (n, 3) seem to lie in air, along each image axis, to rays near the middle of the lens.
 
         Along image axis k the slope of such a ray is (X_k - place_k) / distance_k. Away from a cylinder's two planes of

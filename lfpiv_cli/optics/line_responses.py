@@ -35,7 +35,7 @@ from scipy.interpolate import CubicSpline
 from scipy.ndimage import spline_filter1d
 from scipy.special import j0
 
-from lfpiv_cli.arrays import Floats
+from lfpiv_cli.arrays import Floats, Singles
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.tracing import ObjectSpace, slope_ratios
 from lfpiv_cli.threads import COUNT_NO_REFERENCES
@@ -61,7 +61,7 @@ USUAL_DIFFUSION_PX = 0.3
 # Places along the spot's radius per period of the steepest phase, for a spline through them.
 PER_PERIOD = 17.0
 
-Lines = NDArray[np.float32]
+Lines = Singles
 
 
 class LineResponses(NamedTuple):
@@ -78,8 +78,8 @@ class LineResponses(NamedTuple):
     """
 
     table: Lines
-    signs: NDArray[np.float32]
-    ones: NDArray[np.float32]
+    signs: Singles
+    ones: Singles
     first_depth_mm: float
     depth_step_mm: float
     offset_step_mm: float
@@ -254,7 +254,7 @@ def _on_array(camera: Camera, space: ObjectSpace, depths_mm: Floats, pupil_mm: F
     return np.asarray(pupil_mm * (1.0 - s_i / camera.focal_length_mm + s_i * ratio))
 
 
-def _pixel_products(pupil: _Pupil, number: int) -> NDArray[np.float32]:
+def _pixel_products(pupil: _Pupil, number: int) -> Singles:
     """Return H (offsets >= 0, responses along u, 2 products) at a depth, real: sums of squares, then differences.
 
     The light is the sum of products of the first half's columns at (xi, u) and (eta, v), less that of the second's.
@@ -286,7 +286,7 @@ def _pixel_products(pupil: _Pupil, number: int) -> NDArray[np.float32]:
     return found
 
 
-def _compressed(products: NDArray[np.float32]) -> Lines:
+def _compressed(products: Singles) -> Lines:
     """Return the A (offsets >= 0, responses, TERMS) closest to the whole form: half of them count positive."""
     offsets, responses, _, terms = products.shape
     signs = np.repeat([1.0, -1.0], terms)

@@ -15,9 +15,8 @@ from __future__ import annotations
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
-from lfpiv_cli.arrays import Floats
+from lfpiv_cli.arrays import Flags, Floats
 from lfpiv_cli.optics.shapes import Vector, dot, plus, scaled
 from lfpiv_cli.optics.surfaces import Faces, height_behind, meet, normal_change
 from lfpiv_cli.threads import COUNT_NO_REFERENCES
@@ -189,9 +188,6 @@ def aim(faces: Faces, x: float, y: float, z: float, X: float, Y: float) -> Place
     return NOWHERE
 
 
-Flags = NDArray[np.bool_]
-
-
 @njit(cache=True)
 def aim_all(faces: Faces, points: Floats, crossing: Floats) -> tuple[Floats, Flags]:
     """Return `aim` from each point through each crossing: slopes (n, 2) and whether they are valid (n,)."""
@@ -204,7 +200,7 @@ def aim_all(faces: Faces, points: Floats, crossing: Floats) -> tuple[Floats, Fla
 
 
 @njit(cache=True)
-def pencils(faces: Faces, points: Floats) -> tuple[Floats, Floats, NDArray[np.bool_]]:
+def pencils(faces: Faces, points: Floats) -> tuple[Floats, Floats, Flags]:
     """Return, for the ray from each point through the lens' middle, its slopes (n, 2) and their growth (n, 2, 2).
 
     The growth [k, l] is how slope k grows with the crossing along axis l.

@@ -12,11 +12,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
-from lfpiv_cli.arrays import Floats
+from lfpiv_cli.arrays import Floats, Integers
 from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.threads import COUNT_NO_REFERENCES
 
@@ -243,8 +243,8 @@ class Reliefs(NamedTuple):
     coefficients : of all, flat
     """
 
-    starts: NDArray[np.int64]
-    cells: NDArray[np.int64]
+    starts: Integers
+    cells: Integers
     firsts_mm: Floats
     steps_mm: Floats
     coefficients: Floats

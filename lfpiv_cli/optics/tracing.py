@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 from numba import njit
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from lfpiv_cli.arrays import Floats
+from lfpiv_cli.arrays import Flags, Floats, Integers
 from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.names import Refraction, TracedMethod
 from lfpiv_cli.optics.camera import Camera, KernelCamera, nearest_point
@@ -54,7 +54,7 @@ class PolynomialRays:
     """
 
     scale_mm: Floats
-    exponents: NDArray[np.int64]
+    exponents: Integers
     coefficients_mm: Floats
 
     @property
@@ -86,9 +86,7 @@ class PolynomialRays:
         return polynomial_terms(start_mm, crossing_mm, self.scale_mm, self.exponents) @ self.coefficients_mm
 
 
-def polynomial_terms(
-    start_mm: ArrayLike, crossing_mm: ArrayLike, scale_mm: Floats, exponents: NDArray[np.int64]
-) -> Floats:
+def polynomial_terms(start_mm: ArrayLike, crossing_mm: ArrayLike, scale_mm: Floats, exponents: Integers) -> Floats:
     """Return each term (n, terms) for rays from (n, 3) through (n, 2)."""
     rays = np.concatenate([np.atleast_2d(start_mm), np.atleast_2d(crossing_mm)], axis=1) / scale_mm
     terms = np.ones((len(rays), len(exponents)))
@@ -98,7 +96,7 @@ def polynomial_terms(
     return terms
 
 
-def complete_exponents(degree: int) -> NDArray[np.int64]:
+def complete_exponents(degree: int) -> Integers:
     """Return the exponents (terms, 5) of all terms up to a degree: 21 of degree 2, 56 of degree 3."""
     all_of_them = product(range(degree + 1), repeat=VARIABLES)
     return np.array([powers for powers in all_of_them if sum(powers) <= degree], dtype=np.int64)
@@ -119,7 +117,7 @@ class Hits:
     sensor_mm: Floats
     array_mm: Floats
     lens_mm: Floats
-    valid: NDArray[np.bool_]
+    valid: Flags
 
 
 @njit(cache=True)
@@ -298,7 +296,7 @@ class ObjectSpace:
             raise ConfigError(f"a point at z = {depths.min():g} mm lies in front of the fluid")
         return _polynomials_at(last_layers, reach_mm, self.layers(camera))
 
-    def slopes(self, camera: Camera, points_mm: ArrayLike, crossing_mm: Floats) -> tuple[Floats, NDArray[np.bool_]]:
+    def slopes(self, camera: Camera, points_mm: ArrayLike, crossing_mm: Floats) -> tuple[Floats, Flags]:
         """Return the slopes (n, 2) at the lens of the rays from points (n, 3) that cross it at (n, 2): all of them do.
 
         Raises

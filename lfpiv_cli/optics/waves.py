@@ -34,7 +34,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import fft
 from scipy.special import ndtr
 
-from lfpiv_cli.arrays import Floats
+from lfpiv_cli.arrays import Flags, Floats, Singles
 from lfpiv_cli.optics.camera import Camera, nearest_point, undistorted
 from lfpiv_cli.optics.curved_space import CurvedSpace
 from lfpiv_cli.optics.tracing import ObjectSpace
@@ -158,7 +158,7 @@ class WavesInCamera:
         _write_pixels(light, self.samples, self._to_pixels, collected)
         return Patch(first, collected / len(points))
 
-    def _rays(self, point_mm: Floats) -> tuple[Floats, NDArray[np.bool_]]:
+    def _rays(self, point_mm: Floats) -> tuple[Floats, Flags]:
         """Return where a point's rays through places of the pupil meet the array (places, 2), and which there are."""
         crossing = self._pupil_places
         slopes, seen = self.space.slopes(self.camera, point_mm, crossing)
@@ -176,7 +176,7 @@ class WavesInCamera:
         slopes = np.concatenate([along_x, along_y])
         return slopes, np.linalg.pinv(slopes)
 
-    def _phase(self, array_mm: Floats, seen: NDArray[np.bool_]) -> Floats:
+    def _phase(self, array_mm: Floats, seen: Flags) -> Floats:
         """Return the coefficients (y, x) of the phase, on the pupil of radius 1, whose normals meet the array there."""
         slopes = self._wave_number * self.camera.aperture_radius_mm / self.camera.image_distance_mm * array_mm
         if seen.all():
@@ -333,7 +333,7 @@ def _write_lenses(
 
 
 @njit(cache=True, nogil=True)
-def _add_intensity(field: Complex, light: NDArray[np.float32]) -> None:
+def _add_intensity(field: Complex, light: Singles) -> None:
     """Add the light of a field."""
     for row in range(field.shape[0]):
         for column in range(field.shape[1]):
@@ -341,7 +341,7 @@ def _add_intensity(field: Complex, light: NDArray[np.float32]) -> None:
 
 
 @njit(cache=True, nogil=True)
-def _write_pixels(light: NDArray[np.float32], samples: int, response: Floats, pixels: Floats) -> None:
+def _write_pixels(light: Singles, samples: int, response: Floats, pixels: Floats) -> None:
     """Add up what pixels collect of the light of samples, those of `pixel_response`."""
     size, beside = light.shape[0], (response.size - samples) // 2
     of_rows = np.zeros(size)

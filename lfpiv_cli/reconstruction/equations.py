@@ -12,13 +12,13 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Flags, Singles
 from lfpiv_cli.neighbourhoods import with_neighbours
 from lfpiv_cli.robust import BRIGHTEST_PERCENTILE, LIT_SHARE
 
-Volume = NDArray[np.float32]
-Image = NDArray[np.float32]
+Volume = Singles
+Image = Singles
 
 # Row and column sums below this share of the largest one belong to pixels or voxels that are all but unseen (a sliver
 # of the sensor or of the aperture's rim); they stay out of the equations instead of being divided by.
@@ -49,12 +49,12 @@ class Normalisers:
     inverse_row_sum: Image
     inverse_column_sum: Volume
 
-    def without(self, operator: Operator, excluded: NDArray[np.bool_]) -> Normalisers:
+    def without(self, operator: Operator, excluded: Flags) -> Normalisers:
         """Return the sums with more pixels (rows, columns) left out."""
         inverse_row_sum = np.where(excluded, np.float32(0.0), self.inverse_row_sum)
         return _with_columns(operator, inverse_row_sum, self.inverse_column_sum > 0.0)
 
-    def within(self, operator: Operator, support: NDArray[np.bool_]) -> Normalisers:
+    def within(self, operator: Operator, support: Flags) -> Normalisers:
         """Return the sums with only the voxels of a support (z, y, x), and with the pixels that these reach."""
         support = support & (self.inverse_column_sum > 0.0)
         inverse_row_sum = _guarded_inverse(operator.forward(support.astype(np.float32)))
@@ -84,7 +84,7 @@ class Problem:
         return cls(operator, np.where(taking_part, np.maximum(image, 0.0), 0.0).astype(np.float32), sums)
 
 
-def normalisers(operator: Operator, excluded: NDArray[np.bool_] | None = None) -> Normalisers:
+def normalisers(operator: Operator, excluded: Flags | None = None) -> Normalisers:
     """Return the sums of the weights, without the pixels (rows, columns) that are excluded."""
     inverse_row_sum = _guarded_inverse(operator.forward(np.ones(operator.shape, np.float32)))
     if excluded is not None:
@@ -92,13 +92,13 @@ def normalisers(operator: Operator, excluded: NDArray[np.bool_] | None = None) -
     return _with_columns(operator, inverse_row_sum, np.ones(operator.shape, np.bool_))
 
 
-def _with_columns(operator: Operator, inverse_row_sum: Image, voxels: NDArray[np.bool_]) -> Normalisers:
+def _with_columns(operator: Operator, inverse_row_sum: Image, voxels: Flags) -> Normalisers:
     """Return the sums for pixels that take part as `inverse_row_sum` says, and for voxels (z, y, x) that may."""
     column_sum = operator.adjoint((inverse_row_sum > 0.0).astype(np.float32))
     return Normalisers(inverse_row_sum, np.where(voxels, _guarded_inverse(column_sum), np.float32(0.0)))
 
 
-def _guarded_inverse(sums: NDArray[np.float32]) -> NDArray[np.float32]:
+def _guarded_inverse(sums: Singles) -> Singles:
     """Return 1 / sums, 0 where a sum is negligible beside the largest."""
     limit = SMALLEST_SUM * float(sums.max(initial=0.0))
     return np.divide(np.float32(1.0), sums, out=np.zeros_like(sums), where=sums > limit)
@@ -135,7 +135,7 @@ def line_of_sight_start(problem: Problem) -> Volume:
     return scaled_to_light(problem, np.where(problem.sums.inverse_column_sum > 0.0, np.exp(mean), np.float32(0.0)))
 
 
-def lit_support(operator: Operator, image: Image, sums: Normalisers) -> NDArray[np.bool_]:
+def lit_support(operator: Operator, image: Image, sums: Normalisers) -> Flags:
     """Return which voxels (z, y, x) have nearly all of their weight on lit pixels or their neighbours."""
     taking_part = sums.inverse_row_sum > 0.0
     lit = taking_part & with_neighbours(image > LIT_SHARE * _brightest(image, sums))

@@ -11,13 +11,13 @@ from collections.abc import Callable, Iterable
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Flags, Floats, Singles
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.robust import BRIGHTEST_PERCENTILE, HALF_NORMAL_MEDIAN, MAD_TO_SIGMA
 
-Image = NDArray[np.float32]
-Mask = NDArray[np.bool_]
+Image = Singles
+Mask = Flags
 
 # A brightest pixel that stands at one of these is where the sensor or its converter ends: 8 to 16 bits, the odd ones
 # either in the low bits or shifted up to fill sixteen.
@@ -83,11 +83,9 @@ def mean_background(images: Iterable[Image]) -> Image:
     return (total / count).astype(np.float32)
 
 
-def _over_sequence(
-    images: Iterable[Image], combine: Callable[[NDArray[np.float64], Image], NDArray[np.float64]]
-) -> tuple[NDArray[np.float64], int]:
+def _over_sequence(images: Iterable[Image], combine: Callable[[Floats, Image], Floats]) -> tuple[Floats, int]:
     """Return what a combination of all images, one after the other, comes to, and their number."""
-    result: NDArray[np.float64] | None = None
+    result: Floats | None = None
     count = 0
     for image in images:
         if result is not None and image.shape != result.shape:

@@ -15,8 +15,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.names import Start
 from lfpiv_cli.reconstruction.equations import (
     Image,
@@ -72,7 +72,7 @@ def _divide(part: tuple[int, int], image: Image, projection: Image, inverse_row_
             result[row, column] = image[row, column] / projection[row, column] if seen else np.float32(0.0)
 
 
-def square_differences(image: Image, projection: Image, inverse_row_sum: Image) -> NDArray[np.float64]:
+def square_differences(image: Image, projection: Image, inverse_row_sum: Image) -> Floats:
     """Return the sum of (I - W E)^2 of each row (rows,), so that their sum has the same bits for any threads."""
     result = np.empty(image.shape[0], np.float64)
     share_out(_sum_squares, image.shape[0], image, projection, inverse_row_sum, result)
@@ -81,7 +81,7 @@ def square_differences(image: Image, projection: Image, inverse_row_sum: Image) 
 
 @njit(cache=True, nogil=True)
 def _sum_squares(
-    part: tuple[int, int], image: Image, projection: Image, inverse_row_sum: Image, result: NDArray[np.float64]
+    part: tuple[int, int], image: Image, projection: Image, inverse_row_sum: Image, result: Floats
 ) -> None:
     """Write rows `part` of `square_differences`."""
     for row in range(part[0], part[1]):
@@ -123,7 +123,7 @@ class Stopping:
             return self
         return replace(self, residual=self.noise * noise_residual(image, self.photons_per_count), noise=None)
 
-    def reached(self, residual: NDArray[np.float64]) -> bool:
+    def reached(self, residual: Floats) -> bool:
         """Return whether the residuals (n,) of the iterations so far are the last ones needed."""
         if self.residual is not None and residual[-1] <= self.residual:
             return True
@@ -168,7 +168,7 @@ class Reconstruction:
     """
 
     volume: Volume
-    residual: NDArray[np.float64]
+    residual: Floats
     support_voxels: int
 
 

@@ -12,9 +12,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from lfpiv_cli.arrays import Floats
+from lfpiv_cli.arrays import Flags, Floats
 from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.curved_space import CurvedSpace
@@ -36,7 +35,7 @@ from lfpiv_cli.particles.pencil import MEAN_SQUARE, lines_of
 STEPS = 5
 
 
-def moved_places(points_mm: Floats, before: Faces, after: Faces, radius_mm: float) -> tuple[Floats, NDArray[np.bool_]]:
+def moved_places(points_mm: Floats, before: Faces, after: Faces, radius_mm: float) -> tuple[Floats, Flags]:
     """Return where particles lie behind other faces, their rays being the same.
 
     Parameters
@@ -74,7 +73,7 @@ def _solved(moves: Floats, wanted: Floats) -> Floats:
     return np.asarray(np.linalg.solve(turned @ moves, turned @ wanted[:, :, np.newaxis])[..., 0])
 
 
-def _lines(points_mm: Floats, faces: Faces, radius_mm: float) -> tuple[Floats, Floats, NDArray[np.bool_]]:
+def _lines(points_mm: Floats, faces: Faces, radius_mm: float) -> tuple[Floats, Floats, Flags]:
     """Return the straight lines of the slopes of points (n, 4), their derivatives (n, 4, 3), and which are seen.
 
     The lines are slopes in the lens's middle, and by how much these grow to the root of the mean square over its disc.

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csc_matrix
 from scipy.sparse.linalg import lsqr
 
-from lfpiv_cli.arrays import Floats
+from lfpiv_cli.arrays import Floats, Integers, Singles
 from lfpiv_cli.particles.cells import rim_table
 from lfpiv_cli.particles.fitting import add_all, refine
 from lfpiv_cli.particles.least_squares import UNKNOWNS, lit_by, observation_of, respond_all, room_for
@@ -252,7 +252,7 @@ def _columns(view: View, particles: Floats, root_weight: Floats, capacity: int) 
 @njit(cache=True, nogil=True)
 def _entries(
     view: View, particles: Floats, root_weight: Floats, capacity: int
-) -> tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.float32]]:
+) -> tuple[Integers, NDArray[np.int32], Singles]:
     """Return of particles (n, 4) how many pixels each lights, and rows and values of their columns."""
     counts, at = np.zeros(len(particles), np.int64), 0
     size = UNKNOWNS * len(particles) * capacity

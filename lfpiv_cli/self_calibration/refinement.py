@@ -14,9 +14,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from lfpiv_cli.arrays import Floats
+from lfpiv_cli.arrays import Floats, Singles
 from lfpiv_cli.calibration.model import Calibration, known
 from lfpiv_cli.calibration.wave_shapes import WaveLight
 from lfpiv_cli.grid import Grid
@@ -171,7 +170,7 @@ class ChannelFlow:
 
 
 def refine_calibration(
-    images: Sequence[NDArray[np.float32]],
+    images: Sequence[Singles],
     calibration: Calibration,
     sheet: Camera,
     space: ObjectSpace,
@@ -209,7 +208,7 @@ def refine_calibration(
     weights = Weights(grid, padding, operator, camera.column_axis, calibration)
     sums = normalisers(weights.padded)
 
-    def task(image: NDArray[np.float32], seen: View) -> Task:
+    def task(image: Singles, seen: View) -> Task:
         return task_of(image, seen, weights, camera, sums)
 
     if given is None and (measured := diameter_by([task(images[0], view)])):

@@ -18,9 +18,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from lfpiv_cli.arrays import Floats
+from lfpiv_cli.arrays import Flags, Floats, Singles
 from lfpiv_cli.calibration.model import Calibration
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.grid import Grid
@@ -42,13 +41,7 @@ from lfpiv_cli.self_calibration.movable_scene import (
     place_changes,
 )
 from lfpiv_cli.self_calibration.nuisances import SCENE_STEPS, Nuisances
-from lfpiv_cli.self_calibration.refinement import (
-    PLANES_APART,
-    REFINING_ROUNDS,
-    camera_figures,
-    first_image,
-    shift_px,
-)
+from lfpiv_cli.self_calibration.refinement import PLANES_APART, REFINING_ROUNDS, camera_figures, first_image, shift_px
 from lfpiv_cli.self_calibration.walls import RING_FROM, RoundWallFit, find_round_wall
 from lfpiv_cli.weights.columns import operator_of
 from lfpiv_cli.weights.model import Weights
@@ -176,7 +169,7 @@ def _spread(directions: Floats, covariance: Floats) -> Floats:
 
 
 def refine_scene(
-    images: Sequence[NDArray[np.float32]],
+    images: Sequence[Singles],
     calibration: Calibration,
     sheet: Camera,
     space: CurvedSpace,
@@ -211,7 +204,7 @@ def refine_scene(
         weights = _weights(scene, start.scene, volume, calibration, seen)
         sums = normalisers(weights.padded)
 
-        def task(image: NDArray[np.float32], seen: View, weights: Weights = weights, sums: Any = sums) -> Task:
+        def task(image: Singles, seen: View, weights: Weights = weights, sums: Any = sums) -> Task:
             return task_of(image, seen, weights, camera, sums)
 
         if number == 0 and given is None and (measured := diameter_by([task(images[0], seen)])):
@@ -338,7 +331,7 @@ def _weights(scene: MovableScene, values: Floats, volume: Grid, calibration: Cal
     return Weights(grid, padding, operator_of(camera, space, grid.padded(padding)), camera.column_axis, calibration)
 
 
-def _wall_in_view(view: View, scene: MovableScene, values: Floats, position_mm: Floats) -> NDArray[np.bool_]:
+def _wall_in_view(view: View, scene: MovableScene, values: Floats, position_mm: Floats) -> Flags:
     """Return of which particles (n,) the light of the wall behind them, seen from the axis, falls on the sensor."""
     own = scene.about_axis(position_mm, values)
     distance = np.maximum(np.hypot(own[:, 1], own[:, 2]), np.finfo(np.float64).tiny)

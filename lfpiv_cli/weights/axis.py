@@ -23,6 +23,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Floats, Integers, Singles
 from lfpiv_cli.optics.tracing import slope_ratio
 from lfpiv_cli.threads import share_out
 from lfpiv_cli.weights.lens_cells import AxisOptics, Cells, cut, micro_image_cells, polygon_area, set_rectangle
@@ -47,8 +48,8 @@ class Bending:
     strips : straight pieces in which the aperture is worked on; 1 where rays are straight in front of the lens
     """
 
-    nodes: NDArray[np.float64]
-    factors: NDArray[np.float64]
+    nodes: Floats
+    factors: Floats
     beside_mm2: float = 0.0
     strips: int = 1
 
@@ -64,8 +65,8 @@ class FittedBending:
     strips : straight pieces in which the aperture is worked on
     """
 
-    coefficients_mm: NDArray[np.float64]
-    scale_mm: NDArray[np.float64]
+    coefficients_mm: Floats
+    scale_mm: Floats
     strips: int
 
 
@@ -86,16 +87,16 @@ class AxisScene(NamedTuple):
 
     optics: AxisOptics
     first_lens: int
-    cell_start: NDArray[np.int64]
+    cell_start: Integers
     cell_pixel: NDArray[np.int32]
-    centres_mm: NDArray[np.float64]
+    centres_mm: Floats
     width_mm: float
-    node_share: NDArray[np.float64]
-    nodes: NDArray[np.float64]
-    factors: NDArray[np.float64]
+    node_share: Floats
+    nodes: Floats
+    factors: Floats
     beside_mm2: float
-    fitted_mm: NDArray[np.float64]
-    scale_mm: NDArray[np.float64]
+    fitted_mm: Floats
+    scale_mm: Floats
     strips: int
 
 
@@ -116,16 +117,16 @@ class AxisWeights:
     voxels: int
     pixels: int
     cells: Cells
-    start: NDArray[np.int64]
+    start: Integers
     cell: NDArray[np.int32]
-    share: NDArray[np.float32]
+    share: Singles
 
-    def row(self, plane: int, voxel: int) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
+    def row(self, plane: int, voxel: int) -> tuple[NDArray[np.int32], Singles]:
         """Return the cells of one voxel and their shares."""
         part = slice(*self.start[plane * self.voxels + voxel : plane * self.voxels + voxel + 2])
         return self.cell[part], self.share[part]
 
-    def matrix(self, plane: int) -> NDArray[np.float32]:
+    def matrix(self, plane: int) -> Singles:
         """Return the dense (cells, voxels) matrix of one plane."""
         dense = np.zeros((self.cells.pixel.size, self.voxels), np.float32)
         for voxel in range(self.voxels):
@@ -135,7 +136,7 @@ class AxisWeights:
 
 
 def axis_weights(
-    optics: AxisOptics, centres_mm: NDArray[np.float64], width_mm: float, bending: Bending | FittedBending
+    optics: AxisOptics, centres_mm: Floats, width_mm: float, bending: Bending | FittedBending
 ) -> AxisWeights:
     """Integrate the weights of all voxels along one axis.
 
@@ -177,7 +178,7 @@ def axis_weights(
     return AxisWeights(planes, centres_mm.size, optics.pixels, cells, start, cell, share)
 
 
-def depth_nodes(z_mm: NDArray[np.float64], depth_mm: float) -> NDArray[np.float64]:
+def depth_nodes(z_mm: Floats, depth_mm: float) -> Floats:
     """Return the depths (planes, nodes) at which voxels of `depth_mm` are integrated along z (Gauss-Legendre)."""
     nodes, _ = np.polynomial.legendre.leggauss(DEPTH_NODES)
     return z_mm[:, np.newaxis] + 0.5 * depth_mm * nodes
@@ -187,10 +188,10 @@ def depth_nodes(z_mm: NDArray[np.float64], depth_mm: float) -> NDArray[np.float6
 def _integrate(
     part: tuple[int, int],
     scene: AxisScene,
-    start_of_row: NDArray[np.int64],
-    counts: NDArray[np.int64],
+    start_of_row: Integers,
+    counts: Integers,
     cell: NDArray[np.int32],
-    share_of_cell: NDArray[np.float32],
+    share_of_cell: Singles,
 ) -> None:
     """Fill `counts` (when `start_of_row` is empty) or also `cell` and its share, one plane of `part` after the other.
 
@@ -277,12 +278,12 @@ def _array_place(scene: AxisScene, plane: int, node: int, centre: float, crossin
 @njit(cache=True)
 def _add_lens(
     optics: AxisOptics,
-    polygon: NDArray[np.float64],
+    polygon: Floats,
     line: tuple[float, float, float],
     cell_pixel: NDArray[np.int32],
     scale: float,
-    scratch: NDArray[np.float64],
-    shares: NDArray[np.float64],
+    scratch: Floats,
+    shares: Floats,
 ) -> None:
     """Spread the polygon's area over the cells of its lens: the pixels that a x + b X + offset falls on.
 

@@ -10,8 +10,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.notice import written
@@ -202,7 +202,7 @@ def axis_optics(camera: Camera, widths_mm: tuple[float, float] | None = None) ->
     return first, second
 
 
-def scene_distortion(camera: Camera, media: Media, grid: Grid) -> NDArray[np.float64] | None:
+def scene_distortion(camera: Camera, media: Media, grid: Grid) -> Floats | None:
     """Return the main lens's distortion as it bends the planes (nz,) of a grid, 1/mm^2; None where there is none.
 
     A point at p lights the array at r = p s_i/s_o, moved to r (1 + k1 r^2), as one at p (1 + k1 (s_i/s_o)^2 p^2) would.

@@ -16,6 +16,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Flags, Floats, Integers, Singles
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.neighbourhoods import with_neighbours
@@ -61,10 +62,10 @@ class ColumnOperator:
 
     shape: tuple[int, int, int]
     image_shape: tuple[int, int]
-    voxel: NDArray[np.int64]
+    voxel: Integers
     columns: Columns
 
-    def forward(self, volume: NDArray[np.float32]) -> NDArray[np.float32]:
+    def forward(self, volume: Singles) -> Singles:
         """Return the image (rows, columns) of a volume."""
         light = np.ascontiguousarray(real_array(volume, self.shape, "a volume")).ravel()[self.voxel]
         pixels = self.image_shape[0] * self.image_shape[1]
@@ -72,7 +73,7 @@ class ColumnOperator:
             self.image_shape
         )
 
-    def adjoint(self, image: NDArray[np.float32]) -> NDArray[np.float32]:
+    def adjoint(self, image: Singles) -> Singles:
         """Return the volume that an image is spread back to."""
         volume = np.zeros(self.shape, np.float32)
         flat = np.ascontiguousarray(real_array(image, self.image_shape, "an image"), dtype=np.float32).ravel()
@@ -103,7 +104,7 @@ class OnDemandOperator:
     camera: Camera
     source: Source
     grid: Grid
-    transmission: NDArray[np.float32] | None = None
+    transmission: Singles | None = None
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -116,7 +117,7 @@ class OnDemandOperator:
         """Shape of an image."""
         return self.camera.rows, self.camera.columns
 
-    def forward(self, volume: NDArray[np.float32]) -> NDArray[np.float32]:
+    def forward(self, volume: Singles) -> Singles:
         """Return the image (rows, columns) of a volume; dark voxels cost nothing."""
         flat = np.ascontiguousarray(real_array(volume, self.shape, "a volume")).ravel()
         lit = np.flatnonzero(flat)
@@ -127,7 +128,7 @@ class OnDemandOperator:
             image += _add_columns(flat[part], columns.start, columns.pixel, columns.share, image.size)
         return image.reshape(self.image_shape)
 
-    def adjoint(self, image: NDArray[np.float32]) -> NDArray[np.float32]:
+    def adjoint(self, image: Singles) -> Singles:
         """Return the volume that an image is spread back to; makes every column."""
         image = real_array(image, self.image_shape, "an image")
         volume = np.empty(self.shape, np.float32)
@@ -143,7 +144,7 @@ class OnDemandOperator:
         flat = np.ravel_multi_index(voxel_index((plane, row_voxel, column_voxel), self.shape), self.shape)
         return _as_column(self.columns_of(np.array([flat])), 0, self.image_shape[1])
 
-    def columns_of(self, voxel: NDArray[np.int64]) -> Columns:
+    def columns_of(self, voxel: Integers) -> Columns:
         """Return the columns of voxels given by their flat indices."""
         if not voxel.size:
             return Columns(np.zeros(1, np.int64), np.zeros(0, np.int32), np.zeros(0, np.float32))
@@ -151,7 +152,7 @@ class OnDemandOperator:
         columns = integrate_columns(self.camera, self.source, centres, self.sides_mm, TILES, DEPTH_NODES)
         return columns if self.transmission is None else columns.dimmed(self.transmission)
 
-    def restricted(self, image: NDArray[np.float32]) -> ColumnOperator:
+    def restricted(self, image: Singles) -> ColumnOperator:
         """Return the columns of the voxels that the light of an image can have come from.
 
         Raises
@@ -174,12 +175,12 @@ class OnDemandOperator:
             return self
         return ColumnOperator(self.shape, self.image_shape, voxel, self.columns_of(voxel))
 
-    def _bytes_of(self, voxel: NDArray[np.int64]) -> float:
+    def _bytes_of(self, voxel: Integers) -> float:
         """Return what the columns of voxels take, from those of some of them."""
         sample = self.columns_of(voxel[:: max(1, voxel.size // 64)])
         return float(BYTES_PER_SHARE * sample.pixel.size / max(1, sample.start.size - 1) * voxel.size)
 
-    def can_be_lit(self, image: NDArray[np.float32]) -> NDArray[np.bool_]:
+    def can_be_lit(self, image: Singles) -> Flags:
         """Return which voxels (flat) see only lit pixels along nearly all their lines of sight."""
         lit = image > LIT_SHARE * np.percentile(image, BRIGHTEST_PERCENTILE)
         near = with_neighbours(lit)
@@ -193,16 +194,16 @@ class OnDemandOperator:
         return result
 
     @cached_property
-    def lit(self) -> NDArray[np.bool_] | None:
+    def lit(self) -> Flags | None:
         """Which voxels (planes, row voxels, column voxels) lie in the fluid; None where there are no curved faces."""
         return lit_voxels(self.camera, self.source, self.grid) if isinstance(self.source, CurvedSpace) else None
 
     @cached_property
-    def sides_mm(self) -> NDArray[np.float64]:
+    def sides_mm(self) -> Floats:
         """Sides (3,) of a voxel, image axes."""
         return self.camera.to_image_axes(np.asarray(self.grid.spacing_mm))
 
-    def centres_mm(self, voxel: NDArray[np.int64]) -> NDArray[np.float64]:
+    def centres_mm(self, voxel: Integers) -> Floats:
         """Return the centres (n, 3) of voxels, image axes."""
         return voxel_centres(self.camera, self.grid, np.stack(np.unravel_index(voxel, self.shape), axis=1))
 
@@ -248,13 +249,7 @@ def _as_column(columns: Columns, at: int, width: int) -> Column:
     return row, column, columns.share[part]
 
 
-def _add_columns(
-    light: NDArray[np.float32],
-    start: NDArray[np.int64],
-    pixel: NDArray[np.int32],
-    share: NDArray[np.float32],
-    pixels: int,
-) -> NDArray[np.float32]:
+def _add_columns(light: Singles, start: Integers, pixel: NDArray[np.int32], share: Singles, pixels: int) -> Singles:
     """Return the flat image of the voxels' light."""
     images = np.zeros((PARTS, pixels), np.float32)
     share_out(_add_parts, PARTS, light, start, pixel, share, images)
@@ -263,12 +258,7 @@ def _add_columns(
 
 @njit(cache=True, nogil=True)
 def _add_parts(
-    parts: tuple[int, int],
-    light: NDArray[np.float32],
-    start: NDArray[np.int64],
-    pixel: NDArray[np.int32],
-    share: NDArray[np.float32],
-    images: NDArray[np.float32],
+    parts: tuple[int, int], light: Singles, start: Integers, pixel: NDArray[np.int32], share: Singles, images: Singles
 ) -> None:
     """Add the light of each of `parts` of the voxels to an image of its own, (PARTS, pixels)."""
     size = -(-light.size // PARTS)
@@ -279,9 +269,7 @@ def _add_parts(
                     images[part, pixel[at]] += light[n] * share[at]
 
 
-def _gather(
-    image: NDArray[np.float32], start: NDArray[np.int64], pixel: NDArray[np.int32], share: NDArray[np.float32]
-) -> NDArray[np.float32]:
+def _gather(image: Singles, start: Integers, pixel: NDArray[np.int32], share: Singles) -> Singles:
     """Return for each voxel the sum of its weights times the pixels."""
     values = np.empty(start.size - 1, np.float32)
     share_out(_gather_part, values.size, image, start, pixel, share, values)
@@ -290,12 +278,7 @@ def _gather(
 
 @njit(cache=True, nogil=True)
 def _gather_part(
-    part: tuple[int, int],
-    image: NDArray[np.float32],
-    start: NDArray[np.int64],
-    pixel: NDArray[np.int32],
-    share: NDArray[np.float32],
-    values: NDArray[np.float32],
+    part: tuple[int, int], image: Singles, start: Integers, pixel: NDArray[np.int32], share: Singles, values: Singles
 ) -> None:
     """Write what `_gather` returns for voxels `part`."""
     for n in range(part[0], part[1]):
@@ -306,7 +289,7 @@ def _gather_part(
 
 
 @njit(cache=True, nogil=True)
-def _seen_shares(part: tuple[int, int], scene: Scene, lit: NDArray[np.bool_], seen: NDArray[np.float64]) -> None:
+def _seen_shares(part: tuple[int, int], scene: Scene, lit: Flags, seen: Floats) -> None:
     """Write the shares (n,) of the lines of sight, among those that meet the sensor, that end on lit pixels.
 
     Those of voxels `part`; `lit` is flat.

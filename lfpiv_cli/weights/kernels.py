@@ -22,6 +22,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Integers, Singles
 from lfpiv_cli.simd import (
     COEFFICIENTS,
     GROUP,
@@ -37,9 +38,6 @@ from lfpiv_cli.simd import (
     turn,
 )
 from lfpiv_cli.threads import share_out
-
-Floats = NDArray[np.float32]
-Index = NDArray[np.int64]
 
 # Lines of a strip: those that a register holds, or two hold. And planes: what a block has of a tile stays in the cache.
 STRIP, SLAB = 16, 8
@@ -57,9 +55,9 @@ class Blocks(NamedTuple):
     plane, planes, line : (blocks,) int64, its first plane, how many it has, and its first line
     """
 
-    plane: Index
-    planes: Index
-    line: Index
+    plane: Integers
+    planes: Integers
+    line: Integers
 
 
 class BlockShape(NamedTuple):
@@ -79,9 +77,9 @@ class Terms(NamedTuple):
     share : (terms, sums that share it) float32, its share in each
     """
 
-    start: Index
+    start: Integers
     line: NDArray[np.int32]
-    share: Floats
+    share: Singles
 
 
 class VisitsForward(NamedTuple):
@@ -96,11 +94,11 @@ class VisitsForward(NamedTuple):
     share : (rows, coefficients, LANES) float32, row by row those of the next voxel
     """
 
-    of_tile: Index
-    block: Index
-    start: Index
+    of_tile: Integers
+    block: Integers
+    start: Integers
     voxel: NDArray[np.int32]
-    share: Floats
+    share: Singles
 
 
 class RowSums(NamedTuple):
@@ -113,8 +111,8 @@ class RowSums(NamedTuple):
     terms : of each sum; line p * lines of a block + k is line k in the block's plane p
     """
 
-    of_block: Index
-    group: Index
+    of_block: Integers
+    group: Integers
     terms: Terms
 
 
@@ -130,13 +128,13 @@ class VisitsBack(NamedTuple):
     start, line, share : the first term of each sum, and cell and coefficients (terms, coefficients) of each
     """
 
-    of_tile: Index
-    block: Index
-    owned: Index
+    of_tile: Integers
+    block: Integers
+    owned: Integers
     voxel: NDArray[np.int32]
-    start: Index
+    start: Integers
     line: NDArray[np.int32]
-    share: Floats
+    share: Singles
 
 
 class LitRows(NamedTuple):
@@ -149,20 +147,20 @@ class LitRows(NamedTuple):
     line : (lit cells,) int64, the line of `by_cell` that each has
     """
 
-    start: Index
-    cell: Index
-    line: Index
+    start: Integers
+    cell: Integers
+    line: Integers
 
 
 @njit(cache=True)
-def room_for(size: int) -> Floats:
+def room_for(size: int) -> Singles:
     """Return room for numbers that begins with a line of the cache: a load across two of these takes twice as long."""
     room = np.empty(size + CACHE_LINE, np.float32)
     skipped = -(room.ctypes.data // room.itemsize) % CACHE_LINE
     return room[skipped : skipped + size]
 
 
-def turned(volume: Floats, shape: tuple[int, int]) -> Floats:
+def turned(volume: Singles, shape: tuple[int, int]) -> Singles:
     """Return a volume (planes, rows, columns) as (planes, columns, rows), cut or filled up with zeros to `shape`."""
     found = np.zeros((volume.shape[0], *shape), np.float32)
     share_out(_turn_planes, len(volume), volume, found)
@@ -170,7 +168,7 @@ def turned(volume: Floats, shape: tuple[int, int]) -> Floats:
 
 
 @njit(cache=True, nogil=True)
-def _turn_planes(part: tuple[int, int], volume: Floats, found: Floats) -> None:
+def _turn_planes(part: tuple[int, int], volume: Singles, found: Singles) -> None:
     """Write what a part of the planes are when turned."""
     columns, rows = min(found.shape[1], volume.shape[2]), min(found.shape[2], volume.shape[1])
     for plane in range(part[0], part[1]):
@@ -182,14 +180,14 @@ def _turn_planes(part: tuple[int, int], volume: Floats, found: Floats) -> None:
 @njit(cache=True, nogil=True)
 def project_tiles(
     part: tuple[int, int],
-    volume: Floats,
+    volume: Singles,
     blocks: Blocks,
     shape: BlockShape,
     columns: VisitsForward,
     rows: RowSums,
     groups: int,
-    places: Floats,
-    flat_cell: Floats,
+    places: Singles,
+    flat_cell: Singles,
 ) -> None:
     """Write a part of the tiles of a turned volume's light by cells, flat (tiles, groups * GROUP, TILE)."""
     width, height = volume.shape[1:]
@@ -225,13 +223,13 @@ def project_tiles(
 @njit(cache=True, nogil=True)
 def back_project_slabs(
     part: tuple[int, int],
-    by_cell: Floats,
-    volume: Floats,
+    by_cell: Singles,
+    volume: Singles,
     blocks: Blocks,
     shape: BlockShape,
     rows: Terms,
     columns: VisitsBack,
-    places: Floats,
+    places: Singles,
 ) -> None:
     """Add what light by cells (tiles, row cells, TILE) is spread back to, in a part of a turned volume.
 
@@ -281,7 +279,9 @@ def back_project_slabs(
 
 
 @njit(cache=True, nogil=True)
-def fold_rows(part: tuple[int, int], by_cell: Floats, mask: Floats, runs: Index, rows: LitRows, image: Floats) -> None:
+def fold_rows(
+    part: tuple[int, int], by_cell: Singles, mask: Singles, runs: Integers, rows: LitRows, image: Singles
+) -> None:
     """Write a part of the rows of the image: C times the light of each lit cell, added up by pixel.
 
     `runs` (runs, 5) are neighbouring column cells of a tile, and of a lens: the first one's number among all cells and
@@ -306,12 +306,12 @@ def fold_rows(part: tuple[int, int], by_cell: Floats, mask: Floats, runs: Index,
 @njit(cache=True, nogil=True)
 def unfold_lines(
     part: tuple[int, int],
-    image: Floats,
-    mask: Floats,
+    image: Singles,
+    mask: Singles,
     pixel: NDArray[np.int32],
     row_pixel: NDArray[np.int32],
     first: int,
-    by_cell: Floats,
+    by_cell: Singles,
 ) -> None:
     """Write C times the pixel that each lit cell belongs to, a part of the lit row cells of (tiles, row cells, TILE).
 

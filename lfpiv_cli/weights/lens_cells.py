@@ -12,6 +12,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Floats, Integers, Singles
 from lfpiv_cli.optics.camera import KernelCamera, Lattice
 from lfpiv_cli.threads import share_out
 
@@ -59,9 +60,9 @@ class Cells:
     """
 
     first_lens: int
-    start: NDArray[np.int64]
+    start: Integers
     pixel: NDArray[np.int32]
-    patch_mm: NDArray[np.float64]
+    patch_mm: Floats
 
 
 def micro_image_cells(optics: AxisOptics) -> Cells:
@@ -97,7 +98,7 @@ def micro_image_cells(optics: AxisOptics) -> Cells:
 
 
 @njit(cache=True)
-def cut(polygon: NDArray[np.float64], a: float, b: float, limit: float, out: NDArray[np.float64]) -> int:
+def cut(polygon: Floats, a: float, b: float, limit: float, out: Floats) -> int:
     """Write the part of a polygon where a x + b y <= limit to `out`; return its number of corners."""
     kept, corners = 0, len(polygon)
     for k in range(corners):
@@ -119,7 +120,7 @@ def cut(polygon: NDArray[np.float64], a: float, b: float, limit: float, out: NDA
 
 
 @njit(cache=True)
-def set_rectangle(out: NDArray[np.float64], left: float, right: float, bottom: float, top: float) -> None:
+def set_rectangle(out: Floats, left: float, right: float, bottom: float, top: float) -> None:
     """Write the four corners of a rectangle to `out`."""
     for k, (x, y) in enumerate(((left, bottom), (right, bottom), (right, top), (left, top))):
         out[k, 0] = x
@@ -127,7 +128,7 @@ def set_rectangle(out: NDArray[np.float64], left: float, right: float, bottom: f
 
 
 @njit(cache=True)
-def polygon_area(polygon: NDArray[np.float64]) -> float:
+def polygon_area(polygon: Floats) -> float:
     """Return the area of a polygon."""
     twice = 0.0
     for k in range(1, len(polygon) - 1):
@@ -141,7 +142,7 @@ def polygon_area(polygon: NDArray[np.float64]) -> float:
 MOST_CORNERS = 16
 
 
-def neighbours(lattice: Lattice) -> NDArray[np.float64]:
+def neighbours(lattice: Lattice) -> Floats:
     """Return the steps (8, 2) to the surrounding lattice points; half-way to them ends a lens's region."""
     steps = [(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if (i, j) != (0, 0)]
     return np.array(steps, dtype=np.float64) @ lattice.basis
@@ -149,12 +150,7 @@ def neighbours(lattice: Lattice) -> NDArray[np.float64]:
 
 @njit(cache=True)
 def shared_rectangle(
-    low: tuple[float, float],
-    high: tuple[float, float],
-    centre_x: float,
-    centre_y: float,
-    steps: NDArray[np.float64],
-    work: NDArray[np.float64],
+    low: tuple[float, float], high: tuple[float, float], centre_x: float, centre_y: float, steps: Floats, work: Floats
 ) -> tuple[float, float, float, float, float]:
     """Return the area that a rectangle shares with the region of a lens, its centroid (x, y) and its widths (x, y).
 
@@ -210,7 +206,7 @@ def shared_rectangle(
 DISC_SHARE_OF_SQUARE = np.pi / 4.0
 
 
-def aperture_mask(columns: Cells, rows: Cells, radius_mm: float) -> NDArray[np.float32]:
+def aperture_mask(columns: Cells, rows: Cells, radius_mm: float) -> Singles:
     """Return C (row cells, column cells): the share of each cell's patch inside the disc, over the square's share."""
     mask = np.empty((len(rows.patch_mm), len(columns.patch_mm)), np.float32)
     share_out(_write_mask, len(mask), columns.patch_mm, rows.patch_mm, radius_mm, mask)
@@ -248,13 +244,7 @@ def disc_area_below(x: float, y: float, radius: float) -> float:
 
 
 @njit(cache=True, nogil=True)
-def _write_mask(
-    part: tuple[int, int],
-    columns: NDArray[np.float64],
-    rows: NDArray[np.float64],
-    radius: float,
-    mask: NDArray[np.float32],
-) -> None:
+def _write_mask(part: tuple[int, int], columns: Floats, rows: Floats, radius: float, mask: Singles) -> None:
     """Write rows `part` of `aperture_mask`, from the patches (n, 2) of columns and rows."""
     for r in range(part[0], part[1]):
         y0, y1 = rows[r]

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from lfpiv_cli.arrays import Floats, Singles
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.names import ColumnAxis
 from lfpiv_cli.weights.columns import ColumnOperator, OnDemandOperator
@@ -29,7 +30,7 @@ Separated = TypeVar("Separated", FactorisedOperator, StripOperator)
 WeightsOperator = FactorisedOperator | BrickOperator | StripOperator | ColumnOperator | OnDemandOperator
 
 
-def behind_transmission(operator: WeightsOperator, transmission: NDArray[np.float32]) -> WeightsOperator:
+def behind_transmission(operator: WeightsOperator, transmission: Singles) -> WeightsOperator:
     """Return the weights of pixels that pass a share (rows, columns) of the light."""
     if isinstance(operator, OnDemandOperator):
         return replace(operator, transmission=transmission)
@@ -42,7 +43,7 @@ def behind_transmission(operator: WeightsOperator, transmission: NDArray[np.floa
     return _behind(operator, transmission)
 
 
-def _behind(operator: Separated, transmission: NDArray[np.float32]) -> Separated:
+def _behind(operator: Separated, transmission: Singles) -> Separated:
     cells = np.ix_(operator.rows.cells.pixel, operator.columns.cells.pixel)
     return replace(operator, mask=operator.mask * transmission[cells])
 
@@ -67,7 +68,7 @@ class Weights:
     solver_operator: WeightsOperator
     column_axis: ColumnAxis
     calibration: Calibration | None = None
-    scene_distortion_per_mm2: NDArray[np.float64] | None = None
+    scene_distortion_per_mm2: Floats | None = None
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -92,20 +93,20 @@ class Weights:
         """`raw` where images are used as they are, `rectified` where `prepare` moves them into the array's frame."""
         return "raw" if self.calibration is None else "rectified"
 
-    def prepare(self, image: NDArray[np.float32]) -> NDArray[np.float32]:
+    def prepare(self, image: Singles) -> Singles:
         """Take a raw image (rows, columns) to the frame of the weights."""
         image = real_array(image, self.image_shape, "an image")
         if self.calibration is None:
             return image.astype(np.float32)
         return self.calibration.rectification.apply(image).astype(np.float32)
 
-    def forward(self, volume: NDArray[np.float32]) -> NDArray[np.float32]:
+    def forward(self, volume: Singles) -> Singles:
         """Return the image (rows, columns) that a volume [z, y, x] gives."""
         padded = np.zeros(self.grid.padded(self.padding_xyz).shape_zyx, np.float32)
         padded[self._inner] = real_array(volume, self.shape, "a volume")
         return self.solver_operator.forward(np.ascontiguousarray(self._to_sensor_order(padded)))
 
-    def adjoint(self, image: NDArray[np.float32]) -> NDArray[np.float32]:
+    def adjoint(self, image: Singles) -> Singles:
         """Return the volume [z, y, x] that an image is spread back to."""
         image = real_array(image, self.image_shape, "an image")
         volume = self.solver_operator.adjoint(np.asarray(image, dtype=np.float32))
@@ -131,7 +132,7 @@ class Weights:
         """True where columns are made when asked for; solvers then want `for_image`."""
         return isinstance(self.solver_operator, OnDemandOperator)
 
-    def for_image(self, image: NDArray[np.float32]) -> Weights:
+    def for_image(self, image: Singles) -> Weights:
         """Return the weights to solve one prepared image with: columns on demand are made once and kept.
 
         Raises
@@ -142,7 +143,7 @@ class Weights:
             return self
         return replace(self, solver_operator=self.solver_operator.restricted(image))
 
-    def to_world(self, padded_volume: NDArray[np.float32]) -> NDArray[np.float32]:
+    def to_world(self, padded_volume: Singles) -> Singles:
         """Return the volume (z, y, x) on `grid` in world axes, from one on the padded grid in the array's frame.
 
         A turned array is straightened by turning the image; the volume is turned back here, and the main lens's

@@ -22,22 +22,13 @@ import numpy as np
 from numba import get_num_threads
 from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Floats, Integers, Singles
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.simd import GROUP, LANES, TILE
 from lfpiv_cli.threads import ensure_own_threads, in_threads, share_out
 from lfpiv_cli.weights import kernels
 from lfpiv_cli.weights.axis import AxisWeights
-from lfpiv_cli.weights.kernels import (
-    PLACES,
-    Blocks,
-    BlockShape,
-    Index,
-    LitRows,
-    RowSums,
-    Terms,
-    VisitsBack,
-    VisitsForward,
-)
+from lfpiv_cli.weights.kernels import PLACES, Blocks, BlockShape, LitRows, RowSums, Terms, VisitsBack, VisitsForward
 
 # Planes that go through both steps together, one number forward and one back: what they hold of a tile stays in the
 # second-level cache, what the neighbouring sums share of it in the first, and yet the sums over them are long.
@@ -76,7 +67,7 @@ def voxel_index(index: tuple[Any, ...], shape: tuple[int, ...]) -> tuple[int, ..
 
 
 # Pixel rows, pixel columns and weights of one voxel.
-Column = tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float32]]
+Column = tuple[Integers, Integers, Singles]
 
 
 class Visits(NamedTuple):
@@ -90,12 +81,12 @@ class Visits(NamedTuple):
     plane, voxel, cell : (entries,) int64; plane in the block, cell in the tile
     """
 
-    of_tile: Index
-    block: Index
-    of_entry: Index
-    plane: Index
-    voxel: Index
-    cell: Index
+    of_tile: Integers
+    block: Integers
+    of_entry: Integers
+    plane: Integers
+    voxel: Integers
+    cell: Integers
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,12 +104,12 @@ class BlockProducts:
 
     columns: AxisWeights
     rows: AxisWeights
-    mask: NDArray[np.float32]
+    mask: Singles
     order: NDArray[np.int32]
     forward_blocks: tuple[Blocks, BlockShape]
     back_blocks: tuple[Blocks, BlockShape]
 
-    def project(self, volume: NDArray[np.float32]) -> NDArray[np.float32]:
+    def project(self, volume: Singles) -> Singles:
         """Return the image (rows, columns) of a turned volume (planes, voxels along the columns, lines)."""
         columns, (blocks, shape) = self._columns_forward, self.forward_blocks
         tiles, groups = columns.of_tile.size - 1, self._groups
@@ -130,7 +121,7 @@ class BlockProducts:
         share_out(kernels.fold_rows, len(image), by_cell, self.mask, self._runs, self._lines_of_rows, image)
         return image
 
-    def back_project(self, image: NDArray[np.float32], shape: tuple[int, int, int]) -> NDArray[np.float32]:
+    def back_project(self, image: Singles, shape: tuple[int, int, int]) -> Singles:
         """Return the turned volume of a shape that an image is spread back to."""
         tiles, (first, last) = filled(self.order.size, TILE) // TILE, self._lit_rows
         pixel, row_pixel = self.columns.cells.pixel[self.order], self.rows.cells.pixel[first:last]
@@ -157,11 +148,11 @@ class BlockProducts:
         return lit_range(self.rows.cell)
 
     @cached_property
-    def _sorted_mask(self) -> NDArray[np.float32]:
+    def _sorted_mask(self) -> Singles:
         return np.ascontiguousarray(self.mask[:, self.order])
 
     @cached_property
-    def _line_of_cell(self) -> Index:
+    def _line_of_cell(self) -> Integers:
         """The line of each lit row cell in the sum: no group spans two lenses, whose voxels differ."""
         first, last = self._lit_rows
         cell, starts = np.arange(first, last), self.rows.cells.start
@@ -184,7 +175,7 @@ class BlockProducts:
         return LitRows(start, first + order, self._line_of_cell[order])
 
     @cached_property
-    def _runs(self) -> Index:
+    def _runs(self) -> Integers:
         """The runs (runs, 5) of lit column cells side by side in a tile and a lens; see `kernels.fold_rows`."""
         place = np.argsort(self.order)
         cell = self.order[place].astype(np.int64)
@@ -197,7 +188,7 @@ class BlockProducts:
         pixel, counts = self.columns.cells.pixel[cell[begins]], np.diff(begins, append=cell.size)
         return np.stack([cell[begins], place[begins], pixel, counts, steps], axis=1).astype(np.int64)
 
-    def _visits(self, blocks: Blocks, slab_of_block: Index, slabs: int) -> Visits:
+    def _visits(self, blocks: Blocks, slab_of_block: Integers, slabs: int) -> Visits:
         """Return the visits of some blocks, those of a tile and a slab together."""
         first = np.concatenate([[0], np.cumsum(blocks.planes)])
         plane, voxel = np.divmod(line_of(self.columns), self.columns.voxels)
@@ -266,7 +257,7 @@ class BlockProducts:
         sums = blocks.plane.size * shape.lines * pairs
         return packed(group, cell, plane % GROUP, self.rows.share, (sums, GROUP))
 
-    def _block_lines(self, blocks: Blocks) -> tuple[Index, Index, Index]:
+    def _block_lines(self, blocks: Blocks) -> tuple[Integers, Integers, Integers]:
         """Return the block of each entry of the weights along the rows, its plane in the block, and its line."""
         first = np.concatenate([[0], np.cumsum(blocks.planes)])
         plane, line = np.divmod(line_of(self.rows), self.rows.voxels)
@@ -286,7 +277,7 @@ class FactorisedOperator:
 
     columns: AxisWeights
     rows: AxisWeights
-    mask: NDArray[np.float32]
+    mask: Singles
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -298,14 +289,14 @@ class FactorisedOperator:
         """Shape of an image."""
         return self.rows.pixels, self.columns.pixels
 
-    def forward(self, volume: NDArray[np.float32]) -> NDArray[np.float32]:
+    def forward(self, volume: Singles) -> Singles:
         """Return the image (rows, columns) of a volume [plane, row voxel, column voxel]."""
         ensure_own_threads()
         volume = real_array(volume, self.shape, "a volume")
         _, height, width = self.shape
         return self._products.project(kernels.turned(volume, (width, filled(height, LANES))))
 
-    def adjoint(self, image: NDArray[np.float32]) -> NDArray[np.float32]:
+    def adjoint(self, image: Singles) -> Singles:
         """Return the volume [plane, row voxel, column voxel] that an image is spread back to."""
         ensure_own_threads()
         image = real_array(image, self.image_shape, "an image")
@@ -360,11 +351,11 @@ class BrickOperator:
         """Shape of an image."""
         return self.even.image_shape
 
-    def forward(self, volume: NDArray[np.float32]) -> NDArray[np.float32]:
+    def forward(self, volume: Singles) -> Singles:
         """Return the image (rows, columns) of a volume [plane, row voxel, column voxel]."""
         return self.even.forward(volume) + self.odd.forward(volume)
 
-    def adjoint(self, image: NDArray[np.float32]) -> NDArray[np.float32]:
+    def adjoint(self, image: Singles) -> Singles:
         """Return the volume [plane, row voxel, column voxel] that an image is spread back to."""
         return self.even.adjoint(image) + self.odd.adjoint(image)
 
@@ -378,7 +369,7 @@ class BrickOperator:
         return pixel // width, pixel % width, total
 
 
-def forward_reference(operator: FactorisedOperator, volume: NDArray[np.float32]) -> NDArray[np.float64]:
+def forward_reference(operator: FactorisedOperator, volume: Singles) -> Floats:
     """Return the image of a volume as dense matrix products: the readable twin of `FactorisedOperator.forward`."""
     by_cell = np.zeros(operator.mask.shape)
     for plane in range(operator.shape[0]):
@@ -388,7 +379,7 @@ def forward_reference(operator: FactorisedOperator, volume: NDArray[np.float32])
     return image
 
 
-def adjoint_reference(operator: FactorisedOperator, image: NDArray[np.float32]) -> NDArray[np.float64]:
+def adjoint_reference(operator: FactorisedOperator, image: Singles) -> Floats:
     """Return the adjoint as dense matrix products: the readable twin of `FactorisedOperator.adjoint`."""
     pixels = np.ix_(operator.rows.cells.pixel, operator.columns.cells.pixel)
     by_cell = image.astype(np.float64)[pixels] * operator.mask
@@ -396,9 +387,7 @@ def adjoint_reference(operator: FactorisedOperator, image: NDArray[np.float32]) 
     return np.stack([operator.rows.matrix(k).T @ by_cell @ operator.columns.matrix(k) for k in planes])
 
 
-def spans(
-    owner: NDArray[np.int64], place: NDArray[np.int64], owners: int
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def spans(owner: Integers, place: Integers, owners: int) -> tuple[Integers, Integers]:
     """Return the lowest place of each owner and how far it is to the highest, one included; 0, 0 where it has none."""
     low, high = np.full(owners, np.iinfo(np.int64).max), np.full(owners, -1)
     np.minimum.at(low, owner, place)
@@ -407,13 +396,7 @@ def spans(
     return low, high - low + 1
 
 
-def packed(
-    group: NDArray[np.int64],
-    line: NDArray[np.int64],
-    member: NDArray[np.int64],
-    share: NDArray[np.float32],
-    shape: tuple[int, int],
-) -> Terms:
+def packed(group: Integers, line: Integers, member: Integers, share: Singles, shape: tuple[int, int]) -> Terms:
     """Gather the shares of each (group, line) into one term; `shape` counts groups and the members of each."""
     lines = int(line.max(initial=0)) + 1
     keys, term = np.unique(group * lines + line, return_inverse=True)
@@ -428,7 +411,7 @@ def filled(size: Any, multiple: int) -> Any:
     return -(-size // multiple) * multiple
 
 
-def line_of(axis: AxisWeights) -> NDArray[np.int64]:
+def line_of(axis: AxisWeights) -> Integers:
     """Return the row plane * voxels + voxel of each entry of a table."""
     return np.repeat(np.arange(axis.start.size - 1), np.diff(axis.start))
 

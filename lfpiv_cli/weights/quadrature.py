@@ -17,6 +17,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
+from lfpiv_cli.arrays import Floats, Integers, Singles
 from lfpiv_cli.optics.camera import Camera, KernelCamera
 from lfpiv_cli.optics.curved_space import CurvedSpace
 from lfpiv_cli.optics.ray_bundles import aim
@@ -57,15 +58,15 @@ class Columns:
     share : float32 share of the voxel's light
     """
 
-    start: NDArray[np.int64]
+    start: Integers
     pixel: NDArray[np.int32]
-    share: NDArray[np.float32]
+    share: Singles
 
-    def dimmed(self, transmission: NDArray[np.float32]) -> Columns:
+    def dimmed(self, transmission: Singles) -> Columns:
         """Return the columns behind pixels that pass a share (rows, columns) of the light."""
         return Columns(self.start, self.pixel, self.share * transmission.ravel()[self.pixel])
 
-    def image(self, voxel: int, shape: tuple[int, int]) -> NDArray[np.float64]:
+    def image(self, voxel: int, shape: tuple[int, int]) -> Floats:
         """Return one column as an image (rows, columns)."""
         part = slice(self.start[voxel], self.start[voxel + 1])
         image = np.zeros(shape[0] * shape[1])
@@ -115,14 +116,12 @@ def integrate_columns(
         first = last
     start = np.concatenate([[0], np.cumsum(np.concatenate([*counts, []]))]).astype(np.int64)
     return Columns(
-        start,
-        np.concatenate([*pixels, []]).astype(np.int32),
-        np.concatenate([*shares, np.zeros(0, np.float32)]),
+        start, np.concatenate([*pixels, []]).astype(np.int32), np.concatenate([*shares, np.zeros(0, np.float32)])
     )
 
 
 @njit(cache=True)
-def _half_face(scene: Scene, point: NDArray[np.float64], plane: int, node: int) -> tuple[float, float]:
+def _half_face(scene: Scene, point: Floats, plane: int, node: int) -> tuple[float, float]:
     """Return half the widths on the array of a voxel's face at the depth of `point`, seen from the lens's middle.
 
     Of a side outside the fluid the other half is taken; of both, what the focal plane would show.
@@ -149,7 +148,7 @@ def _half_face(scene: Scene, point: NDArray[np.float64], plane: int, node: int) 
 
 
 @njit(cache=True, nogil=True)
-def _set_boxes(part: tuple[int, int], scene: Scene, boxes: NDArray[np.int64]) -> None:
+def _set_boxes(part: tuple[int, int], scene: Scene, boxes: Integers) -> None:
     """Set what of the sensor voxels `part` can light: (n, 4) first row and column, and those behind.
 
     Found from the rays through the rim: light under a lens stays within the aperture's image about its centre. That of
@@ -186,9 +185,7 @@ def _set_boxes(part: tuple[int, int], scene: Scene, boxes: NDArray[np.int64]) ->
 
 
 @njit(cache=True, nogil=True)
-def _fill(
-    part: tuple[int, int], scene: Scene, boxes: NDArray[np.int64], first: int, pictures: NDArray[np.float64]
-) -> None:
+def _fill(part: tuple[int, int], scene: Scene, boxes: Integers, first: int, pictures: Floats) -> None:
     """Add up the light of the voxels from `first` on in pictures `part` of (voxels, rows, columns of their boxes)."""
     work = np.empty((2, MOST_CORNERS, 2))
     lines = np.empty((2, MOST_PIXELS))
@@ -209,10 +206,10 @@ def _add_tile(
     scene: Scene,
     face: tuple[float, float, float, float],
     tile: tuple[float, float, float],
-    box: NDArray[np.int64],
-    work: NDArray[np.float64],
-    lines: NDArray[np.float64],
-    picture: NDArray[np.float64],
+    box: Integers,
+    work: Floats,
+    lines: Floats,
+    picture: Floats,
 ) -> None:
     """Add the light that a voxel's face sends through one tile.
 
@@ -261,7 +258,7 @@ def _add_tile(
 
 @njit(cache=True)
 def _line(
-    middle: float, first_width: float, second_width: float, low: int, high: int, shares: NDArray[np.float64]
+    middle: float, first_width: float, second_width: float, low: int, high: int, shares: Floats
 ) -> tuple[int, int]:
     """Fill in the shares of pixels low to high of light spread about `middle`; return the first pixel and their number.
 
@@ -338,7 +335,7 @@ def count_rays(
     voxel_mm: ArrayLike,
     rng: np.random.Generator,
     count: RayCount = PAPERS_COUNT,
-) -> NDArray[np.float64]:
+) -> Floats:
     """Return the image (rows, columns) of the shares of a voxel's rays that strike each pixel.
 
     Parameters
@@ -367,7 +364,7 @@ def count_rays(
 def count_columns(
     camera: Camera,
     space: ObjectSpace | CurvedSpace,
-    centres_mm: NDArray[np.float64],
+    centres_mm: Floats,
     voxel_mm: ArrayLike,
     rng: np.random.Generator,
     count: RayCount = PAPERS_COUNT,
@@ -405,12 +402,12 @@ def unit_random(state: np.uint64) -> float:
 @njit(cache=True, nogil=True)
 def _count(
     parts: tuple[int, int],
-    rays: tuple[NDArray[np.float64], NDArray[np.uint64], int],
+    rays: tuple[Floats, NDArray[np.uint64], int],
     faces: Faces,
-    nodes: NDArray[np.float64],
-    factors: NDArray[np.float64],
+    nodes: Floats,
+    factors: Floats,
     camera: KernelCamera,
-    counts: NDArray[np.int64],
+    counts: Integers,
 ) -> None:
     """Add up the rays that strike each pixel, `parts` of (parts, rows * columns).
 

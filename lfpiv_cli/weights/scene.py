@@ -13,8 +13,8 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Flags, Floats, Integers
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.camera import Camera, KernelCamera
 from lfpiv_cli.optics.curved_space import CurvedSpace
@@ -40,15 +40,13 @@ from lfpiv_cli.weights.lens_cells import disc_area_below, neighbours
 RIM = np.array([[0.0, 0.0], [1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
 
 
-def places_on_array(
-    camera: Camera, space: CurvedSpace, points_mm: NDArray[np.float64], crossing_mm: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+def places_on_array(camera: Camera, space: CurvedSpace, points_mm: Floats, crossing_mm: Floats) -> tuple[Floats, Flags]:
     """Return where rays from (n, 3) through (n, 2) meet the array, without the distortion, and whether they do."""
     slopes, valid = space.slopes(camera, points_mm, crossing_mm)
     return crossing_mm + camera.image_distance_mm * (slopes - crossing_mm / camera.focal_length_mm), valid
 
 
-def lit_voxels(camera: Camera, space: CurvedSpace, grid: Grid) -> NDArray[np.bool_]:
+def lit_voxels(camera: Camera, space: CurvedSpace, grid: Grid) -> Flags:
     """Return which voxels (planes, row voxels, column voxels) have their middle in the fluid, wholly in view."""
     first, second = (0, 1) if camera.column_axis == "x" else (1, 0)
     axes = (grid.axis_mm(first), grid.axis_mm(second), grid.axis_mm(2))
@@ -60,11 +58,7 @@ def lit_voxels(camera: Camera, space: CurvedSpace, grid: Grid) -> NDArray[np.boo
 
 @njit(cache=True, nogil=True)
 def _write_lit(
-    part: tuple[int, int],
-    faces: Faces,
-    axes: tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]],
-    rim: NDArray[np.float64],
-    lit: NDArray[np.bool_],
+    part: tuple[int, int], faces: Faces, axes: tuple[Floats, Floats, Floats], rim: Floats, lit: Flags
 ) -> None:
     """Write planes `part` of `lit_voxels`."""
     for plane in range(part[0], part[1]):
@@ -99,8 +93,8 @@ Source = ObjectSpace | PolynomialRays | CurvedSpace
 class Tiles:
     """Squares on the main lens: middles (n, 2) of their parts inside the aperture, shares (n,) of it, their side."""
 
-    middle_mm: NDArray[np.float64]
-    share: NDArray[np.float64]
+    middle_mm: Floats
+    share: Floats
     side_mm: float
 
 
@@ -123,24 +117,24 @@ class Scene(NamedTuple):
     """
 
     camera: KernelCamera
-    centres_mm: NDArray[np.float64]
-    sides_mm: NDArray[np.float64]
-    plane: NDArray[np.int64]
-    depth_mm: NDArray[np.float64]
-    depth_share: NDArray[np.float64]
-    slopes: NDArray[np.float64]
-    scale_mm: NDArray[np.float64]
-    exponents: NDArray[np.int64]
-    coefficients_mm: NDArray[np.float64]
+    centres_mm: Floats
+    sides_mm: Floats
+    plane: Integers
+    depth_mm: Floats
+    depth_share: Floats
+    slopes: Floats
+    scale_mm: Floats
+    exponents: Integers
+    coefficients_mm: Floats
     degree: int
     faces: Faces
-    aimed_mm: NDArray[np.float64]
-    aimed_fit: NDArray[np.float64]
-    tile_mm: NDArray[np.float64]
-    tile_share: NDArray[np.float64]
+    aimed_mm: Floats
+    aimed_fit: Floats
+    tile_mm: Floats
+    tile_share: Floats
     tile_side_mm: float
     cell_radius_mm: float
-    neighbours_mm: NDArray[np.float64]
+    neighbours_mm: Floats
 
 
 def aperture_tiles(radius_mm: float, per_side: int) -> Tiles:
@@ -162,12 +156,7 @@ def aperture_tiles(radius_mm: float, per_side: int) -> Tiles:
 
 
 def kernel_scene(
-    camera: Camera,
-    source: Source,
-    centres: NDArray[np.float64],
-    sides: NDArray[np.float64],
-    tiles_per_side: int,
-    depth_nodes: int,
+    camera: Camera, source: Source, centres: Floats, sides: Floats, tiles_per_side: int, depth_nodes: int
 ) -> Scene:
     """Return what the kernels take for voxels at (n, 3) with sides (3,), image axes.
 
@@ -217,7 +206,7 @@ def kernel_scene(
     )
 
 
-def aimed_rays(radius_mm: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def aimed_rays(radius_mm: float) -> tuple[Floats, Floats]:
     """Return crossings (m, 2) of an aperture, and what gives the polynomial through values there, (powers, m).
 
     Row a (AIMED_DEGREE + 1) + b belongs to the powers a of X and b of Y, both in radii.
@@ -235,7 +224,7 @@ def aimed_rays(radius_mm: float) -> tuple[NDArray[np.float64], NDArray[np.float6
 
 
 @njit(cache=True)
-def rays_from(scene: Scene, point: NDArray[np.float64], plane: int, node: int) -> NDArray[np.float64]:
+def rays_from(scene: Scene, point: Floats, plane: int, node: int) -> Floats:
     """Return what `on_array` needs of a point (3,) at one of its plane's depths.
 
     Traced rays: nodes and factors of `slope_ratio`, (2, 1, SLOPE_NODES). Fitted ones, and those behind curved faces:
@@ -275,9 +264,7 @@ def rays_from(scene: Scene, point: NDArray[np.float64], plane: int, node: int) -
 
 
 @njit(cache=True)
-def rays_at_depth(
-    scene: Scene, voxel: NDArray[np.float64], plane: int, node: int, point: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def rays_at_depth(scene: Scene, voxel: Floats, plane: int, node: int, point: Floats) -> Floats:
     """Set a point (3,) to one of the depths of the voxel about `voxel` (3,), and return its rays.
 
     A depth outside the fluid counts as the voxel's middle.
@@ -293,9 +280,7 @@ def rays_at_depth(
 
 # Inlined: to hand over all of a scene at each ray costs as much as the ray itself.
 @njit(cache=True, inline="always")
-def on_array(
-    scene: Scene, point: NDArray[np.float64], rays: NDArray[np.float64], lens_x: float, lens_y: float
-) -> tuple[float, float]:
+def on_array(scene: Scene, point: Floats, rays: Floats, lens_x: float, lens_y: float) -> tuple[float, float]:
     """Return where the ray from a point through (lens_x, lens_y) meets the array, without the distortion."""
     if scene.degree == 0:
         dx, dy = lens_x - point[0], lens_y - point[1]
@@ -349,7 +334,7 @@ def curved_padding(camera: Camera, space: CurvedSpace, grid: Grid) -> tuple[int,
     return _within_fluid(camera, space, grid, 0, int(x)), _within_fluid(camera, space, grid, 1, int(y)), 0
 
 
-def spread_mm(camera: Camera, space: CurvedSpace, grid: Grid) -> NDArray[np.float64]:
+def spread_mm(camera: Camera, space: CurvedSpace, grid: Grid) -> Floats:
     """Return how far from its own line of sight a point shares pixels with others, along both image axes (2,), in mm.
 
     Half a lens and the spread on the array, taken back to the flow by how far apart neighbouring voxels are seen.
@@ -376,7 +361,7 @@ def spread_mm(camera: Camera, space: CurvedSpace, grid: Grid) -> NDArray[np.floa
     return spread
 
 
-def sample(camera: Camera, grid: Grid) -> NDArray[np.float64]:
+def sample(camera: Camera, grid: Grid) -> Floats:
     """Return the middles (n, 3) of some voxels of a grid, those of its faces among them, image axes."""
     axes = [np.linspace(grid.axis_mm(k)[0], grid.axis_mm(k)[-1], SAMPLES) for k in range(3)]
     return camera.to_image_axes(np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 3))
@@ -395,7 +380,7 @@ def _within_fluid(camera: Camera, space: CurvedSpace, grid: Grid, axis: int, mos
     return most
 
 
-def seen_depths_mm(camera: Camera, space: CurvedSpace, grid: Grid) -> NDArray[np.float64]:
+def seen_depths_mm(camera: Camera, space: CurvedSpace, grid: Grid) -> Floats:
     """Return the depths in the fluid at which plane windows would show a sample of a grid, along both axes; 0 if none.
 
     Behind a cylinder a point has two, which differ.

@@ -16,6 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Flags, Floats, Integers
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.curved_space import CurvedSpace
@@ -89,9 +90,9 @@ class StripScene:
     optics: tuple[AxisOptics, AxisOptics]
     cells: tuple[Cells, Cells]
     order: NDArray[np.int32]
-    tile: NDArray[np.int64]
-    part: NDArray[np.int64]
-    lit: NDArray[np.bool_]
+    tile: Integers
+    part: Integers
+    lit: Flags
     across: int
 
     @property
@@ -99,7 +100,7 @@ class StripScene:
         """Image axis along the strips."""
         return 1 - self.across
 
-    def centres_mm(self, axis: int) -> NDArray[np.float64]:
+    def centres_mm(self, axis: int) -> Floats:
         """Return the centres of the voxels along an image axis."""
         return self.grid.axis_mm(self.world(axis))
 
@@ -118,12 +119,7 @@ class Block(NamedTuple):
 
 
 def strip_scene(
-    camera: Camera,
-    space: CurvedSpace,
-    grid: Grid,
-    optics: tuple[AxisOptics, AxisOptics],
-    lit: NDArray[np.bool_],
-    turned: bool,
+    camera: Camera, space: CurvedSpace, grid: Grid, optics: tuple[AxisOptics, AxisOptics], lit: Flags, turned: bool
 ) -> StripScene:
     """Return what blocks are made of, strips being of rows of voxels, or of columns where `turned`."""
     cells = micro_image_cells(optics[0]), micro_image_cells(optics[1])
@@ -152,7 +148,7 @@ def strip_scene(
     return StripScene(camera, space, grid, optics, cells, order, tile, part, lines, across)
 
 
-def part_of_cells(cells: Cells, radius_mm: float, parts: int) -> NDArray[np.int64]:
+def part_of_cells(cells: Cells, radius_mm: float, parts: int) -> Integers:
     """Return which of so many equal parts of the aperture each cell sees; that of two that share their sums is one."""
     middle = cells.patch_mm.mean(axis=1)
     lens = np.searchsorted(cells.start, np.arange(middle.size), side="right") - 1
@@ -199,7 +195,7 @@ def rays_of(scene: StripScene, planes: slice, lines: slice, rays: int) -> StripR
     return strip_rays(scene.camera, scene.space, np.stack(centres, axis=1), ends, sides, scene.across, rays)
 
 
-def stray(rays: StripRays, left_mm: NDArray[np.float64], pitch_mm: float) -> float:
+def stray(rays: StripRays, left_mm: Floats, pitch_mm: float) -> float:
     """Return the share of light that goes astray in the worst box of a part of a strip, by what a fit leaves (n,).
 
     A ray that arrives d off is taken to another lens with the probability d / pitch, which two lenses notice.
@@ -241,7 +237,7 @@ class AcrossFits(NamedTuple):
     fits: list[AxisFit]
     sharing: int
     off: float
-    places_mm: NDArray[np.float64] | None
+    places_mm: Floats | None
 
 
 def fits_across(scene: StripScene, rays: StripRays) -> AcrossFits:
@@ -278,7 +274,7 @@ def _fits_across(scene: StripScene, rays: StripRays, degree_beside: int | None) 
 
 
 def _fits_of_parts(
-    whole: AxisFit, left_mm: NDArray[np.float64], which: NDArray[np.int64], parts: int, pitch_mm: float
+    whole: AxisFit, left_mm: Floats, which: Integers, parts: int, pitch_mm: float
 ) -> tuple[list[AxisFit], float]:
     """Return a fit for the rays (n,) of each part, and the light that goes astray."""
     fits, left = [], left_mm.copy()
@@ -289,7 +285,7 @@ def _fits_of_parts(
 
 
 def _factors_along(
-    scene: StripScene, rays: StripRays, planes: slice, lines: slice, lit: NDArray[np.bool_]
+    scene: StripScene, rays: StripRays, planes: slice, lines: slice, lit: Flags
 ) -> tuple[list[Factor], float]:
     """Return the factors along a strip, one a part of the aperture across it, and the worst misfit of their lines."""
     axis, across = scene.along, scene.across
@@ -320,8 +316,8 @@ def _factors_along(
 
 
 def _factors_across(
-    scene: StripScene, rays: StripRays, planes: slice, lines: slice, lit: NDArray[np.bool_]
-) -> Iterator[tuple[range, NDArray[np.float64], Factor]]:
+    scene: StripScene, rays: StripRays, planes: slice, lines: slice, lit: Flags
+) -> Iterator[tuple[range, Floats, Factor]]:
     """Yield some tiles of column cells, the share (voxels,) of each voxel's light, and the factor across for these."""
     axis = scene.across
     depths = depth_nodes(scene.centres_mm(2)[planes], scene.grid.spacing_mm[2])
@@ -433,13 +429,8 @@ def factorise_strips(camera: Camera, space: CurvedSpace, grid: Grid, optics: Opt
 
 
 def sample_lit(
-    camera: Camera,
-    space: CurvedSpace,
-    grid: Grid,
-    lit: NDArray[np.bool_],
-    count: int,
-    rng: np.random.Generator,
-) -> NDArray[np.int64]:
+    camera: Camera, space: CurvedSpace, grid: Grid, lit: Flags, count: int, rng: np.random.Generator
+) -> Integers:
     """Return (n, 3) random voxels [plane, row voxel, column voxel], at most so many, all corners of which are seen."""
     inside = np.argwhere(lit)
     some = inside[rng.permutation(len(inside))[: 4 * count]]
@@ -449,7 +440,7 @@ def sample_lit(
     return np.asarray(some[seen][:count])
 
 
-def voxel_centres(camera: Camera, grid: Grid, voxels: NDArray[np.int64]) -> NDArray[np.float64]:
+def voxel_centres(camera: Camera, grid: Grid, voxels: Integers) -> Floats:
     """Return the centres (n, 3), image axes, of voxels [plane, row voxel, column voxel]."""
     first, second = (0, 1) if camera.column_axis == "x" else (1, 0)
     axes = (grid.axis_mm(first)[voxels[:, 2]], grid.axis_mm(second)[voxels[:, 1]], grid.axis_mm(2)[voxels[:, 0]])
@@ -457,13 +448,8 @@ def voxel_centres(camera: Camera, grid: Grid, voxels: NDArray[np.int64]) -> NDAr
 
 
 def misfits_l1(
-    operator: StripOperator,
-    camera: Camera,
-    space: CurvedSpace,
-    grid: Grid,
-    voxels: NDArray[np.int64],
-    tiles: int = SAMPLE_TILES,
-) -> NDArray[np.float64]:
+    operator: StripOperator, camera: Camera, space: CurvedSpace, grid: Grid, voxels: Integers, tiles: int = SAMPLE_TILES
+) -> Floats:
     """Return how far the columns of voxels (n, 3) are from those of traced rays, in L1."""
     sides = camera.to_image_axes(np.asarray(grid.spacing_mm))
     found = []

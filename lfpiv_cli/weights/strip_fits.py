@@ -21,6 +21,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Flags, Floats, Integers, Singles
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.curved_space import CurvedSpace
 from lfpiv_cli.threads import share_out
@@ -36,31 +37,29 @@ from lfpiv_cli.weights.scene import places_on_array
 class Factor(NamedTuple):
     """Weights along one axis: entries (planes, voxels) of each voxel, and cell and share of each."""
 
-    counts: NDArray[np.int64]
+    counts: Integers
     cell: NDArray[np.int32]
-    share: NDArray[np.float32]
+    share: Singles
 
-    def chosen(self, keep: NDArray[np.bool_]) -> Factor:
+    def chosen(self, keep: Flags) -> Factor:
         """Return the entries that are kept."""
         first = np.concatenate([[0], np.cumsum(keep)])
         ends = first[np.concatenate([[0], np.cumsum(self.counts)])]
         return Factor(np.diff(ends).reshape(self.counts.shape), self.cell[keep], self.share[keep])
 
-    def scaled(self, voxel_share: NDArray[np.float64]) -> Factor:
+    def scaled(self, voxel_share: Floats) -> Factor:
         """Return a share of each voxel's light (voxels,), alike in all planes; without entries where it is none."""
         of_entry = np.repeat(np.tile(voxel_share, len(self.counts)), self.counts.ravel())
         scale = of_entry.astype(np.float32).reshape(-1, *[1] * (self.share.ndim - 1))
         return self._replace(share=self.share * scale).chosen(of_entry > 0.0)
 
 
-def mixed_shares(along_mm: NDArray[np.float64], places_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+def mixed_shares(along_mm: Floats, places_mm: Floats) -> Floats:
     """Return the share (n, places) of ascending places in what is mixed linearly at (n,); beyond them the last's."""
     return np.stack([np.interp(along_mm, places_mm, each) for each in np.eye(len(places_mm))], axis=1)
 
 
-def through_lines(
-    weights: AxisWeights, powers: NDArray[np.float64], through: NDArray[np.float64]
-) -> tuple[Factor, NDArray[np.float64]]:
+def through_lines(weights: AxisWeights, powers: Floats, through: Floats) -> tuple[Factor, Floats]:
     """Return the polynomials (planes, voxels) through the weights on some lines of each plane, and their misfit in L1.
 
     Parameters
@@ -81,17 +80,17 @@ def through_lines(
 @njit(cache=True, nogil=True)
 def _write_polynomials(
     part: tuple[int, int],
-    first: NDArray[np.int64],
+    first: Integers,
     cells: int,
-    start: NDArray[np.int64],
+    start: Integers,
     cell: NDArray[np.int32],
-    share: NDArray[np.float32],
-    powers: NDArray[np.float64],
-    through: NDArray[np.float64],
+    share: Singles,
+    powers: Floats,
+    through: Floats,
     found_cell: NDArray[np.int32],
-    found: NDArray[np.float32],
-    counts: NDArray[np.int64],
-    off: NDArray[np.float64],
+    found: Singles,
+    counts: Integers,
+    off: Floats,
 ) -> None:
     """Write what `through_lines` returns for some planes, those of plane p from entry `first[p]` on."""
     lines, voxels = powers.shape[1], counts.shape[1]
@@ -154,16 +153,16 @@ class StripRays:
     radius_mm : of the aperture
     """
 
-    start_mm: NDArray[np.float64]
-    crossing_mm: NDArray[np.float64]
-    array_mm: NDArray[np.float64]
+    start_mm: Floats
+    crossing_mm: Floats
+    array_mm: Floats
     along: int
     across: int
-    middle_mm: NDArray[np.float64]
-    half_mm: NDArray[np.float64]
+    middle_mm: Floats
+    half_mm: Floats
     radius_mm: float
 
-    def variables(self, axis: int, beside: bool) -> NDArray[np.float64]:
+    def variables(self, axis: int, beside: bool) -> Floats:
         """Return what the factor along an image axis knows of each ray, (n, 3) or (n, 4), each from -1 to 1.
 
         Own coordinate, depth and crossing, and `beside`, where it is known, the coordinate along the other axis.
@@ -185,8 +184,8 @@ class AxisFit:
     degree_beside : highest power of the coordinate along the other axis; None: it is not known
     """
 
-    exponents: NDArray[np.int64]
-    coefficients_mm: NDArray[np.float64]
+    exponents: Integers
+    coefficients_mm: Floats
     rays: StripRays
     axis: int
     degree_beside: int | None
@@ -200,7 +199,7 @@ class AxisFit:
             ends.append(_terms(known, self.exponents) @ self.coefficients_mm)
         return float(np.percentile(np.abs(ends[1] - ends[0]), 90.0))
 
-    def bending(self, depths_mm: NDArray[np.float64], beside_mm: NDArray[np.float64] | None = None) -> FittedBending:
+    def bending(self, depths_mm: Floats, beside_mm: Floats | None = None) -> FittedBending:
         """Return the polynomials in own coordinate, from the middle, and crossing, at depths (planes, nodes).
 
         Where the coordinate along the other axis is known, at one place of it in each plane, (planes,).
@@ -223,13 +222,7 @@ class AxisFit:
 
 
 def strip_rays(
-    camera: Camera,
-    space: CurvedSpace,
-    lines_mm: NDArray[np.float64],
-    ends_mm: NDArray[np.float64],
-    sides_mm: NDArray[np.float64],
-    across: int,
-    rays: int,
+    camera: Camera, space: CurvedSpace, lines_mm: Floats, ends_mm: Floats, sides_mm: Floats, across: int, rays: int
 ) -> StripRays | None:
     """Return rays from the lines of voxels at (n, 2) across the strip and in depth, image axes; None if none are seen.
 
@@ -256,7 +249,7 @@ def strip_rays(
     return StripRays(start, crossing, array, along, across, 0.5 * (low + high), 0.5 * (high - low), radius)
 
 
-def evenly_spread(count: int, dimensions: int) -> NDArray[np.float64]:
+def evenly_spread(count: int, dimensions: int) -> Floats:
     """Return points (count, dimensions) that fill the unit cube evenly: multiples of the roots of x^(d+1) = x + 1."""
     root = 2.0
     for _ in range(60):
@@ -266,14 +259,14 @@ def evenly_spread(count: int, dimensions: int) -> NDArray[np.float64]:
 
 
 @cache
-def _exponents(degree: int, degree_beside: int | None) -> NDArray[np.int64]:
+def _exponents(degree: int, degree_beside: int | None) -> Integers:
     """Return the powers (terms, 3), with the other axis's coordinate (terms, 4), of polynomials of a degree."""
     own = range(degree + 1)
     powers = product(*[own] * 3, *([] if degree_beside is None else [range(min(degree_beside, degree) + 1)]))
     return np.array([each for each in powers if sum(each) <= degree])
 
 
-def _terms(variables: NDArray[np.float64], exponents: NDArray[np.int64]) -> NDArray[np.float64]:
+def _terms(variables: Floats, exponents: Integers) -> Floats:
     """Return each term (n, terms) of variables (n, k)."""
     powers = variables[:, :, np.newaxis] ** np.arange(exponents.max() + 1)
     terms = powers[:, 0, exponents[:, 0]]
@@ -282,7 +275,7 @@ def _terms(variables: NDArray[np.float64], exponents: NDArray[np.int64]) -> NDAr
     return terms
 
 
-def fit_axis(rays: StripRays, axis: int, degree_beside: int | None) -> tuple[AxisFit, NDArray[np.float64]]:
+def fit_axis(rays: StripRays, axis: int, degree_beside: int | None) -> tuple[AxisFit, Floats]:
     """Return the fit to all rays along an axis, and what it leaves of each (n,), mm.
 
     Of the coordinate along the other axis it knows powers up to `degree_beside`; None: nothing of it.
@@ -293,9 +286,7 @@ def fit_axis(rays: StripRays, axis: int, degree_beside: int | None) -> tuple[Axi
     return AxisFit(exponents, coefficients, rays, axis, degree_beside), left
 
 
-def fit_part(
-    fit: AxisFit, left_mm: NDArray[np.float64], chosen: NDArray[np.bool_]
-) -> tuple[AxisFit, NDArray[np.float64]]:
+def fit_part(fit: AxisFit, left_mm: Floats, chosen: Flags) -> tuple[AxisFit, Floats]:
     """Return the fit that suits some of the rays (n,), and what it leaves of these, from what the fit to all leaves."""
     degree = next((each for each, rays in DEGREE_OF_PARTS.items() if np.count_nonzero(chosen) >= rays), None)
     if degree is None:
@@ -309,9 +300,7 @@ def fit_part(
     return replace(fit, coefficients_mm=coefficients), left
 
 
-def _solved(
-    variables: NDArray[np.float64], exponents: NDArray[np.int64], place: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _solved(variables: Floats, exponents: Integers, place: Floats) -> tuple[Floats, Floats]:
     """Return the coefficients that follow places best, and what they leave."""
     terms = _terms(variables, exponents)
     normal = terms.T @ terms

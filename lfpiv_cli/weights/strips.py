@@ -23,6 +23,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Flags, Floats, Singles
 from lfpiv_cli.threads import ensure_own_threads
 from lfpiv_cli.weights import kernels
 from lfpiv_cli.weights.axis import AxisWeights
@@ -51,11 +52,11 @@ class StripOperator:
     columns: AxisWeights
     rows: AxisWeights
     blocks: Blocks
-    mask: NDArray[np.float32]
+    mask: Singles
     order: NDArray[np.int32]
-    lit: NDArray[np.bool_]
+    lit: Flags
     turned: bool
-    misfit_l1: NDArray[np.float64]
+    misfit_l1: Floats
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -69,14 +70,14 @@ class StripOperator:
         rows, columns = self.rows.pixels, self.columns.pixels
         return (columns, rows) if self.turned else (rows, columns)
 
-    def forward(self, volume: NDArray[np.float32]) -> NDArray[np.float32]:
+    def forward(self, volume: Singles) -> Singles:
         """Return the image (rows, columns) of a volume."""
         ensure_own_threads()
         lines = self._as_lines(real_array(volume, self.shape, "a volume") * self.lit)
         image = self._products.project(kernels.turned(lines, (lines.shape[2], self._height)))
         return np.ascontiguousarray(image.T) if self.turned else image
 
-    def adjoint(self, image: NDArray[np.float32]) -> NDArray[np.float32]:
+    def adjoint(self, image: Singles) -> Singles:
         """Return the volume that an image is spread back to."""
         ensure_own_threads()
         image = real_array(image, self.image_shape, "an image")
