@@ -32,7 +32,7 @@ from lfpiv_cli.weights import strip_blocks
 from lfpiv_cli.weights.build import blur_radius_mm, factorise_through
 from lfpiv_cli.weights.columns import OnDemandOperator, operator_of, seen_share
 from lfpiv_cli.weights.kernels import STRIP
-from lfpiv_cli.weights.model import Weights, behind_transmission
+from lfpiv_cli.weights.model import Weights
 from lfpiv_cli.weights.quadrature import RayCount, count_rays, integrate_columns, sampling_error
 from lfpiv_cli.weights.scene import aimed_misfit_mm, curved_padding, lit_voxels, places_on_array
 from lfpiv_cli.weights.strip_fits import DEGREE_ALONG, evenly_spread, fit_axis, fit_part, mixed_shares, strip_rays
@@ -400,7 +400,7 @@ def test_transmission_scales_pixels_of_turned_strips(table2, water, rng):
     operator = operator_of(camera, tube_along((0.0, 1.0, 0.0), water), grid)
     assert operator.turned
     passing, volume = rng.random(operator.image_shape, np.float32), rng.random(operator.shape, np.float32)
-    dimmed = behind_transmission(operator, passing).forward(volume)
+    dimmed = operator.behind(passing).forward(volume)
     np.testing.assert_allclose(dimmed, operator.forward(volume) * passing, rtol=1e-5, atol=1e-6)
 
 

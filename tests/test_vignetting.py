@@ -14,7 +14,6 @@ from lfpiv_cli.optics.tracing import ObjectSpace
 from lfpiv_cli.synthetic.render import render_white
 from lfpiv_cli.weights.build import factorise
 from lfpiv_cli.weights.columns import OnDemandOperator
-from lfpiv_cli.weights.model import behind_transmission
 
 SHAPE = (520, 760)
 
@@ -61,7 +60,7 @@ def test_weights_behind_a_transmission_scale_their_pixels(table2, water, rng):
     on_demand = OnDemandOperator(camera, ObjectSpace(water, None, "paraxial"), grid)
     volume = rng.random(grid.shape_zyx, dtype=np.float32)
     for operator in (factorise(camera, water, grid), on_demand, on_demand.restricted(np.ones((260, 380), np.float32))):
-        dimmed = behind_transmission(operator, transmission)
+        dimmed = operator.behind(transmission)
         np.testing.assert_allclose(dimmed.forward(volume), operator.forward(volume) * transmission, atol=1e-6)
         image = rng.random((260, 380), dtype=np.float32)
         np.testing.assert_allclose(dimmed.adjoint(image), operator.adjoint(image * transmission), rtol=1e-5)

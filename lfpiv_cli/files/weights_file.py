@@ -56,8 +56,8 @@ from lfpiv_cli.weights.build import axis_optics
 from lfpiv_cli.weights.columns import ColumnOperator, OnDemandOperator
 from lfpiv_cli.weights.kernels import SLAB, STRIP, Blocks
 from lfpiv_cli.weights.lens_cells import AxisOptics, aperture_mask, micro_image_cells
-from lfpiv_cli.weights.model import Weights, WeightsOperator, behind_transmission
-from lfpiv_cli.weights.operators import BrickOperator, Column, FactorisedOperator
+from lfpiv_cli.weights.model import Weights
+from lfpiv_cli.weights.operators import Column, FactorisedOperator, SeparatedOperator, WeightsOperator
 from lfpiv_cli.weights.quadrature import Columns
 from lfpiv_cli.weights.scene import Source
 from lfpiv_cli.weights.strips import StripOperator
@@ -143,7 +143,7 @@ class WeightsFile:
         """Return the same with the vignetting in the weights, as a file has it once it is read."""
         if self.passed is None:
             return self
-        operator = behind_transmission(self.weights.solver_operator, self.passed)
+        operator = self.weights.solver_operator.behind(self.passed)
         return replace(self, weights=replace(self.weights, solver_operator=operator))
 
 
@@ -229,7 +229,7 @@ def _operator_tree(operator: WeightsOperator) -> dict[str, Any]:
         columns = operator.columns
         return {"counted": {"start": columns.start, "pixel": columns.pixel, "share": columns.share}}
     axes: dict[str, Any] = {}
-    if isinstance(operator, (FactorisedOperator, StripOperator)):
+    if isinstance(operator, SeparatedOperator):
         for name, axis in (("columns", operator.columns), ("rows", operator.rows)):
             axes[name] = {"start": axis.start, "cell": axis.cell, "share": axis.share}
     if isinstance(operator, FactorisedOperator):
@@ -243,7 +243,7 @@ def _operator_tree(operator: WeightsOperator) -> dict[str, Any]:
         }
         strips |= {f"block_{name}": table for name, table in operator.blocks._asdict().items()}
         return {"strips": strips} | axes
-    if isinstance(operator, BrickOperator):
+    if not isinstance(operator, OnDemandOperator):
         raise TypeError("bricks stand for hexagonal cells where particles are looked for, and are not stored")
     space = operator.source
     if isinstance(space, CurvedSpace):
@@ -311,7 +311,7 @@ def _strips(
     is_whole = np.isin(by_column.cell, order).all() and order.min(initial=0) >= 0
     if not is_whole or order.max(initial=0) >= by_column.cells.pixel.size:
         raise ValueError("the order of the cells misses some")
-    return StripOperator(by_column, by_row, blocks, mask, order, lit.astype(bool), turned, misfit.astype(np.float64))
+    return StripOperator(by_column, by_row, mask, blocks, order, lit.astype(bool), turned, misfit.astype(np.float64))
 
 
 def _source(tree: dict[str, Any], calibration: Calibration | None) -> Source:

@@ -30,8 +30,8 @@ from lfpiv_cli.reference import Reference
 from lfpiv_cli.verbs import weights_cost
 from lfpiv_cli.weights.build import default_padding, scene_distortion
 from lfpiv_cli.weights.columns import ColumnOperator, OnDemandOperator, operator_of, seen_share
-from lfpiv_cli.weights.model import Weights, WeightsOperator
-from lfpiv_cli.weights.operators import FactorisedOperator
+from lfpiv_cli.weights.model import Weights
+from lfpiv_cli.weights.operators import FactorisedOperator, WeightsOperator
 from lfpiv_cli.weights.quadrature import RayCount, count_columns
 from lfpiv_cli.weights.scene import Source, aimed_misfit_mm, curved_padding
 from lfpiv_cli.weights.strips import StripOperator

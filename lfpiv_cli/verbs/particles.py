@@ -51,7 +51,6 @@ from lfpiv_cli.verbs.frames import (
 from lfpiv_cli.verbs.tracers import Diffusion, TracerSize, light_notices, size_notices
 from lfpiv_cli.weights.build import factorise_bricks
 from lfpiv_cli.weights.columns import OnDemandOperator
-from lfpiv_cli.weights.model import behind_transmission
 
 # Frames that are looked at for the tracers' diameter, if the first do not hold enough.
 LOOKED_AT = 5
@@ -156,7 +155,7 @@ def searchable(content: WeightsFile, settings: Config) -> WeightsFile:
     if isinstance(space, CurvedSpace):
         return replace(content, weights=replace(weights, solver_operator=operator.kept()))
     bricks = factorise_bricks(content.camera, settings.media_model(), weights.padded.grid)
-    passing = bricks if operator.transmission is None else behind_transmission(bricks, operator.transmission)
+    passing = bricks if operator.transmission is None else bricks.behind(operator.transmission)
     return replace(content, weights=replace(weights, solver_operator=passing))
 
 

@@ -1,6 +1,6 @@
 """Weights as columns, for cameras whose two axes do not separate: made on demand, or kept for chosen voxels.
 
-Both operators have the same three verbs as the factorised one. `OnDemandOperator` keeps nothing and integrates columns
+`OnDemandOperator` keeps nothing and integrates columns
 as they are asked for, a block at a time; `ColumnOperator` keeps those of the voxels that can be lit at all. A column of
 Table 2's camera has some 1,500 pixels, 12 kB.
 
@@ -9,12 +9,14 @@ Axes: volumes [plane, row voxel, column voxel] in the order of the sensor's axes
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from abc import abstractmethod
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from lfpiv_cli.arrays import Flags, Floats, Integers, Singles
 from lfpiv_cli.errors import InputError
@@ -26,7 +28,7 @@ from lfpiv_cli.optics.tracing import struck_pixel
 from lfpiv_cli.robust import BRIGHTEST_PERCENTILE, LIT_SHARE
 from lfpiv_cli.threads import share_out
 from lfpiv_cli.weights.build import axis_optics, factorise_through, separates, strips_of
-from lfpiv_cli.weights.operators import Column, FactorisedOperator, real_array, voxel_index
+from lfpiv_cli.weights.operators import Column, FactorisedOperator, WeightsOperator
 from lfpiv_cli.weights.quadrature import DEPTH_NODES, TILES, Columns, integrate_columns
 from lfpiv_cli.weights.scene import Scene, Source, kernel_scene, lit_voxels, on_array, on_sensor, rays_from
 from lfpiv_cli.weights.strip_blocks import factorise_strips, voxel_centres
@@ -48,49 +50,71 @@ SIGHT_TILES = 8
 SEEN_SAMPLES = 5
 
 
+class CompressedOperator(WeightsOperator):
+    """Weights by columns of voxels; these go by their numbers in a volume read plane by plane and row by row."""
+
+    @abstractmethod
+    def parts(self, voxel: Integers) -> Iterator[tuple[Integers, Columns]]:
+        """Yield ascending voxels and their columns, part by part: at least those of some that have any."""
+
+    def _image_of(self, volume: Singles) -> Singles:
+        light, image = np.ascontiguousarray(volume).ravel(), np.zeros(math.prod(self.image_shape), np.float32)
+        for voxel, columns in self.parts(np.flatnonzero(light)):
+            images = np.zeros((PARTS, image.size), np.float32)
+            share_out(_add_parts, PARTS, light[voxel], columns, images)
+            image += images.sum(axis=0)
+        return image.reshape(self.image_shape)
+
+    def _volume_of(self, image: Singles) -> Singles:
+        pixels, volume = np.ascontiguousarray(image, dtype=np.float32).ravel(), np.zeros(self.shape, np.float32)
+        for voxel, columns in self.parts(np.arange(volume.size)):
+            values = np.empty(voxel.size, np.float32)
+            share_out(_gather_part, voxel.size, pixels, columns, values)
+            volume.ravel()[voxel] = values
+        return volume
+
+    def _column_of(self, plane: int, row_voxel: int, column_voxel: int) -> Column:
+        own = np.ravel_multi_index((plane, row_voxel, column_voxel), self.shape)
+        voxel, columns = next(self.parts(np.array([own])))
+        part = slice(*columns.start[np.searchsorted(voxel, [own, own + 1])])
+        row, column = np.divmod(columns.pixel[part].astype(np.int64), self.image_shape[1])
+        return row, column, columns.share[part]
+
+
 @dataclass(frozen=True, eq=False)
-class ColumnOperator:
+class ColumnOperator(CompressedOperator):
     """The weights of chosen voxels; the others are dark and stay so.
 
     Attributes
     ----------
-    shape : of a volume, (planes, row voxels, column voxels)
-    image_shape : of an image, (rows, columns)
-    voxel : (n,) int64, flat indices of the voxels that have columns, ascending
+    of_shape, of_image_shape : shapes of volume and image
+    voxel : (n,) of the voxels that have columns, ascending
     columns : their columns
     """
 
-    shape: tuple[int, int, int]
-    image_shape: tuple[int, int]
+    of_shape: tuple[int, int, int]
+    of_image_shape: tuple[int, int]
     voxel: Integers
     columns: Columns
 
-    def forward(self, volume: Singles) -> Singles:
-        """Return the image (rows, columns) of a volume."""
-        light = np.ascontiguousarray(real_array(volume, self.shape, "a volume")).ravel()[self.voxel]
-        pixels = self.image_shape[0] * self.image_shape[1]
-        return _add_columns(light, self.columns.start, self.columns.pixel, self.columns.share, pixels).reshape(
-            self.image_shape
-        )
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        return self.of_shape
 
-    def adjoint(self, image: Singles) -> Singles:
-        """Return the volume that an image is spread back to."""
-        volume = np.zeros(self.shape, np.float32)
-        flat = np.ascontiguousarray(real_array(image, self.image_shape, "an image"), dtype=np.float32).ravel()
-        volume.ravel()[self.voxel] = _gather(flat, self.columns.start, self.columns.pixel, self.columns.share)
-        return volume
+    @property
+    def image_shape(self) -> tuple[int, int]:
+        return self.of_image_shape
 
-    def column(self, plane: int, row_voxel: int, column_voxel: int) -> Column:
-        """Return the rows, columns (int64) and weights (float32) of the pixels that one voxel lights."""
-        flat = int(np.ravel_multi_index(voxel_index((plane, row_voxel, column_voxel), self.shape), self.shape))
-        at = int(np.searchsorted(self.voxel, flat))
-        if at == self.voxel.size or self.voxel[at] != flat:
-            return np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0, np.float32)
-        return _as_column(self.columns, at, self.image_shape[1])
+    def behind(self, transmission: Singles) -> ColumnOperator:
+        return replace(self, columns=self.columns.dimmed(transmission))
+
+    def parts(self, voxel: Integers) -> Iterator[tuple[Integers, Columns]]:
+        """Yield all that there are."""
+        yield self.voxel, self.columns
 
 
 @dataclass(frozen=True, eq=False)
-class OnDemandOperator:
+class OnDemandOperator(CompressedOperator):
     """The weights of all voxels of a grid, integrated when asked for.
 
     Attributes
@@ -108,41 +132,21 @@ class OnDemandOperator:
 
     @property
     def shape(self) -> tuple[int, int, int]:
-        """Shape of a volume: (planes, voxels along the rows, voxels along the columns)."""
         nz, ny, nx = self.grid.shape_zyx
         return (nz, ny, nx) if self.camera.column_axis == "x" else (nz, nx, ny)
 
     @property
     def image_shape(self) -> tuple[int, int]:
-        """Shape of an image."""
         return self.camera.rows, self.camera.columns
 
-    def forward(self, volume: Singles) -> Singles:
-        """Return the image (rows, columns) of a volume; dark voxels cost nothing."""
-        flat = np.ascontiguousarray(real_array(volume, self.shape, "a volume")).ravel()
-        lit = np.flatnonzero(flat)
-        image = np.zeros(self.image_shape[0] * self.image_shape[1], np.float32)
-        for first in range(0, lit.size, VOXELS_AT_ONCE):
-            part = lit[first : first + VOXELS_AT_ONCE]
-            columns = self.columns_of(part)
-            image += _add_columns(flat[part], columns.start, columns.pixel, columns.share, image.size)
-        return image.reshape(self.image_shape)
+    def behind(self, transmission: Singles) -> OnDemandOperator:
+        return replace(self, transmission=transmission)
 
-    def adjoint(self, image: Singles) -> Singles:
-        """Return the volume that an image is spread back to; makes every column."""
-        image = real_array(image, self.image_shape, "an image")
-        volume = np.empty(self.shape, np.float32)
-        flat, pixels = volume.ravel(), np.ascontiguousarray(image, dtype=np.float32).ravel()
-        for first in range(0, flat.size, VOXELS_AT_ONCE):
-            part = np.arange(first, min(first + VOXELS_AT_ONCE, flat.size))
-            columns = self.columns_of(part)
-            flat[part] = _gather(pixels, columns.start, columns.pixel, columns.share)
-        return volume
-
-    def column(self, plane: int, row_voxel: int, column_voxel: int) -> Column:
-        """Return the rows, columns (int64) and weights (float32) of the pixels that one voxel lights."""
-        flat = np.ravel_multi_index(voxel_index((plane, row_voxel, column_voxel), self.shape), self.shape)
-        return _as_column(self.columns_of(np.array([flat])), 0, self.image_shape[1])
+    def parts(self, voxel: Integers) -> Iterator[tuple[Integers, Columns]]:
+        """Yield those that are asked for, made anew."""
+        for first in range(0, voxel.size, VOXELS_AT_ONCE):
+            part = voxel[first : first + VOXELS_AT_ONCE]
+            yield part, self.columns_of(part)
 
     def columns_of(self, voxel: Integers) -> Columns:
         """Return the columns of voxels given by their flat indices."""
@@ -243,24 +247,10 @@ def seen_share(camera: Camera, source: Source, grid: Grid) -> tuple[float, float
     return float(sums.min()), float(sums.max())
 
 
-def _as_column(columns: Columns, at: int, width: int) -> Column:
-    part = slice(columns.start[at], columns.start[at + 1])
-    row, column = np.divmod(columns.pixel[part].astype(np.int64), width)
-    return row, column, columns.share[part]
-
-
-def _add_columns(light: Singles, start: Integers, pixel: NDArray[np.int32], share: Singles, pixels: int) -> Singles:
-    """Return the flat image of the voxels' light."""
-    images = np.zeros((PARTS, pixels), np.float32)
-    share_out(_add_parts, PARTS, light, start, pixel, share, images)
-    return np.asarray(images.sum(axis=0))
-
-
 @njit(cache=True, nogil=True)
-def _add_parts(
-    parts: tuple[int, int], light: Singles, start: Integers, pixel: NDArray[np.int32], share: Singles, images: Singles
-) -> None:
+def _add_parts(parts: tuple[int, int], light: Singles, columns: Columns, images: Singles) -> None:
     """Add the light of each of `parts` of the voxels to an image of its own, (PARTS, pixels)."""
+    start, pixel, share = columns
     size = -(-light.size // PARTS)
     for part in range(parts[0], parts[1]):
         for n in range(part * size, min((part + 1) * size, light.size)):
@@ -269,18 +259,10 @@ def _add_parts(
                     images[part, pixel[at]] += light[n] * share[at]
 
 
-def _gather(image: Singles, start: Integers, pixel: NDArray[np.int32], share: Singles) -> Singles:
-    """Return for each voxel the sum of its weights times the pixels."""
-    values = np.empty(start.size - 1, np.float32)
-    share_out(_gather_part, values.size, image, start, pixel, share, values)
-    return values
-
-
 @njit(cache=True, nogil=True)
-def _gather_part(
-    part: tuple[int, int], image: Singles, start: Integers, pixel: NDArray[np.int32], share: Singles, values: Singles
-) -> None:
-    """Write what `_gather` returns for voxels `part`."""
+def _gather_part(part: tuple[int, int], image: Singles, columns: Columns, values: Singles) -> None:
+    """Write for each voxel of `part` the sum of its weights times the pixels."""
+    start, pixel, share = columns
     for n in range(part[0], part[1]):
         total = np.float32(0.0)
         for at in range(start[n], start[n + 1]):

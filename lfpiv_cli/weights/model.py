@@ -17,35 +17,14 @@ from scipy import ndimage
 from lfpiv_cli.arrays import Floats, Singles
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.names import ColumnAxis
-from lfpiv_cli.weights.columns import ColumnOperator, OnDemandOperator
-from lfpiv_cli.weights.operators import BrickOperator, Column, FactorisedOperator, real_array, voxel_index
+from lfpiv_cli.weights.columns import OnDemandOperator
+from lfpiv_cli.weights.operators import Column, WeightsOperator, real_array, voxel_index
 from lfpiv_cli.weights.strips import StripOperator
 
 if TYPE_CHECKING:
     from lfpiv_cli.calibration.model import Calibration
 
 Scalar = TypeVar("Scalar", bound=np.generic)
-Separated = TypeVar("Separated", FactorisedOperator, StripOperator)
-
-WeightsOperator = FactorisedOperator | BrickOperator | StripOperator | ColumnOperator | OnDemandOperator
-
-
-def behind_transmission(operator: WeightsOperator, transmission: Singles) -> WeightsOperator:
-    """Return the weights of pixels that pass a share (rows, columns) of the light."""
-    if isinstance(operator, OnDemandOperator):
-        return replace(operator, transmission=transmission)
-    if isinstance(operator, ColumnOperator):
-        return replace(operator, columns=operator.columns.dimmed(transmission))
-    if isinstance(operator, BrickOperator):
-        return BrickOperator(*(_behind(each, transmission) for each in (operator.even, operator.odd)))
-    if isinstance(operator, StripOperator):
-        return _behind(operator, np.ascontiguousarray(transmission.T) if operator.turned else transmission)
-    return _behind(operator, transmission)
-
-
-def _behind(operator: Separated, transmission: Singles) -> Separated:
-    cells = np.ix_(operator.rows.cells.pixel, operator.columns.cells.pixel)
-    return replace(operator, mask=operator.mask * transmission[cells])
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,16 +7,16 @@ mask C of the aperture, so that an image is
 
 all by cells (see `axis`); pixels add up their cells at the end.
 
-Axes: volumes [z, y, x], images [row, column]; where the sensor's columns follow world y the two lateral axes of the
-volume are exchanged on the way in and out.
+Axes: volumes [plane, row voxel, column voxel] in the order of the sensor's axes, images [row, column].
 """
 
 from __future__ import annotations
 
 import operator
-from dataclasses import dataclass
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numba import get_num_threads
@@ -70,6 +70,47 @@ def voxel_index(index: tuple[Any, ...], shape: tuple[int, ...]) -> tuple[int, ..
 Column = tuple[Integers, Integers, Singles]
 
 
+class WeightsOperator(ABC):
+    """The weights of a volume and what is done with them."""
+
+    @property
+    @abstractmethod
+    def shape(self) -> tuple[int, int, int]:
+        """Shape of a volume: (planes, voxels along the rows, voxels along the columns)."""
+
+    @property
+    @abstractmethod
+    def image_shape(self) -> tuple[int, int]:
+        """Shape (rows, columns) of an image."""
+
+    def forward(self, volume: Singles) -> Singles:
+        """Return the image (rows, columns) of a volume [plane, row voxel, column voxel]."""
+        ensure_own_threads()
+        return self._image_of(real_array(volume, self.shape, "a volume"))
+
+    def adjoint(self, image: Singles) -> Singles:
+        """Return the volume [plane, row voxel, column voxel] that an image is spread back to."""
+        ensure_own_threads()
+        return self._volume_of(real_array(image, self.image_shape, "an image"))
+
+    def column(self, plane: int, row_voxel: int, column_voxel: int) -> Column:
+        """Return the rows, columns (int64) and weights (float32) of the pixels that one voxel lights."""
+        return self._column_of(*voxel_index((plane, row_voxel, column_voxel), self.shape))
+
+    @abstractmethod
+    def behind(self, transmission: Singles) -> WeightsOperator:
+        """Return the weights of pixels that pass a share (rows, columns) of the light."""
+
+    @abstractmethod
+    def _image_of(self, volume: Singles) -> Singles: ...
+
+    @abstractmethod
+    def _volume_of(self, image: Singles) -> Singles: ...
+
+    @abstractmethod
+    def _column_of(self, plane: int, row_voxel: int, column_voxel: int) -> Column: ...
+
+
 class Visits(NamedTuple):
     """Which tiles and blocks meet, and where each entry of the weights along the columns belongs.
 
@@ -90,24 +131,41 @@ class Visits(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class BlockProducts:
-    """The products of separated weights in blocks, and the tables that they take, made when they are first needed.
+class SeparatedOperator(WeightsOperator):
+    """Weights of two factors in blocks, and the tables that their products take, made when they are first needed.
 
     Attributes
     ----------
     columns, rows : the weights along the columns and the rows, of the planes of one block after the other
-    mask : (row cells, column cells) float32
-    order : of the lit column cells, int32: a block may have those of some tiles only
-    forward_blocks, back_blocks : where the blocks of both products lie, and how large they are; none of the latter
-        crosses a multiple of its planes
+    mask : (row cells, column cells) float32, C and whatever else scales the light
     """
 
     columns: AxisWeights
     rows: AxisWeights
     mask: Singles
-    order: NDArray[np.int32]
-    forward_blocks: tuple[Blocks, BlockShape]
-    back_blocks: tuple[Blocks, BlockShape]
+
+    @property
+    @abstractmethod
+    def lit_cells(self) -> NDArray[np.int32]:
+        """The lit column cells in an order: a block may have those of some tiles only."""
+
+    @property
+    @abstractmethod
+    def forward_blocks(self) -> tuple[Blocks, BlockShape]:
+        """Where the blocks of `forward` lie, and how large they are."""
+
+    @property
+    @abstractmethod
+    def back_blocks(self) -> tuple[Blocks, BlockShape]:
+        """Where the blocks of `adjoint` lie, and how large they are; none crosses a multiple of its planes."""
+
+    @property
+    def image_shape(self) -> tuple[int, int]:
+        return self.rows.pixels, self.columns.pixels
+
+    def behind(self, transmission: Singles) -> Self:
+        cells = np.ix_(self.rows.cells.pixel, self.columns.cells.pixel)
+        return replace(self, mask=self.mask * transmission[cells])
 
     def project(self, volume: Singles) -> Singles:
         """Return the image (rows, columns) of a turned volume (planes, voxels along the columns, lines)."""
@@ -123,8 +181,8 @@ class BlockProducts:
 
     def back_project(self, image: Singles, shape: tuple[int, int, int]) -> Singles:
         """Return the turned volume of a shape that an image is spread back to."""
-        tiles, (first, last) = filled(self.order.size, TILE) // TILE, self._lit_rows
-        pixel, row_pixel = self.columns.cells.pixel[self.order], self.rows.cells.pixel[first:last]
+        tiles, (first, last) = filled(self.lit_cells.size, TILE) // TILE, self._lit_rows
+        pixel, row_pixel = self.columns.cells.pixel[self.lit_cells], self.rows.cells.pixel[first:last]
         by_cell = kernels.room_for(tiles * (last - first) * TILE).reshape(tiles, last - first, TILE)
         by_cell[-1:] = 0.0
         share_out(kernels.unfold_lines, last - first, image, self._sorted_mask, pixel, row_pixel, first, by_cell)
@@ -149,7 +207,7 @@ class BlockProducts:
 
     @cached_property
     def _sorted_mask(self) -> Singles:
-        return np.ascontiguousarray(self.mask[:, self.order])
+        return np.ascontiguousarray(self.mask[:, self.lit_cells])
 
     @cached_property
     def _line_of_cell(self) -> Integers:
@@ -177,8 +235,8 @@ class BlockProducts:
     @cached_property
     def _runs(self) -> Integers:
         """The runs (runs, 5) of lit column cells side by side in a tile and a lens; see `kernels.fold_rows`."""
-        place = np.argsort(self.order)
-        cell = self.order[place].astype(np.int64)
+        place = np.argsort(self.lit_cells)
+        cell = self.lit_cells[place].astype(np.int64)
         step, tile = np.diff(place), place // TILE
         beside = (np.diff(cell) == 1) & (np.abs(step) == 1) & (np.diff(tile) == 0)
         beside &= ~np.isin(cell[1:], self.columns.cells.start)
@@ -194,9 +252,9 @@ class BlockProducts:
         plane, voxel = np.divmod(line_of(self.columns), self.columns.voxels)
         block = np.searchsorted(first, plane, side="right") - 1
         rank = np.zeros(self.columns.cells.pixel.size, np.int64)
-        rank[self.order] = np.arange(self.order.size)
+        rank[self.lit_cells] = np.arange(self.lit_cells.size)
         tile, cell = np.divmod(rank[self.columns.cell], TILE)
-        tiles, count = filled(self.order.size, TILE) // TILE, blocks.plane.size
+        tiles, count = filled(self.lit_cells.size, TILE) // TILE, blocks.plane.size
         keys, of_entry = np.unique((tile * slabs + slab_of_block[block]) * count + block, return_inverse=True)
         of_tile = np.searchsorted(keys, count * np.arange(tiles * slabs + 1)).astype(np.int64)
         return Visits(of_tile, keys % count, of_entry, plane - first[block], voxel, cell)
@@ -265,48 +323,43 @@ class BlockProducts:
         return block, plane - first[block], line
 
 
-@dataclass(frozen=True, eq=False)
-class FactorisedOperator:
-    """Weights in factorised form.
-
-    Attributes
-    ----------
-    columns, rows : the per-axis weights along the sensor's columns and rows
-    mask : (row cells, column cells) float32, C and whatever else scales the light
-    """
-
-    columns: AxisWeights
-    rows: AxisWeights
-    mask: Singles
+class FactorisedOperator(SeparatedOperator):
+    """Weights that are two factors as a whole: those of each plane, of all voxels along the columns and the rows."""
 
     @property
     def shape(self) -> tuple[int, int, int]:
-        """Shape of a volume: (planes, voxels along the rows, voxels along the columns)."""
         return self.columns.planes, self.rows.voxels, self.columns.voxels
 
+    @cached_property
+    def lit_cells(self) -> NDArray[np.int32]:
+        """All from the first to the last."""
+        return np.arange(*lit_range(self.columns.cell), dtype=np.int32)
+
     @property
-    def image_shape(self) -> tuple[int, int]:
-        """Shape of an image."""
-        return self.rows.pixels, self.columns.pixels
+    def forward_blocks(self) -> tuple[Blocks, BlockShape]:
+        """Some planes each."""
+        return self._blocks(PLANES_FORWARD)
 
-    def forward(self, volume: Singles) -> Singles:
-        """Return the image (rows, columns) of a volume [plane, row voxel, column voxel]."""
-        ensure_own_threads()
-        volume = real_array(volume, self.shape, "a volume")
+    @property
+    def back_blocks(self) -> tuple[Blocks, BlockShape]:
+        """Some planes each."""
+        return self._blocks(PLANES_BACK)
+
+    def _blocks(self, most: int) -> tuple[Blocks, BlockShape]:
+        planes, height, _ = self.shape
+        first = np.arange(0, planes, most)
+        where = Blocks(first, np.minimum(planes - first, most), np.zeros_like(first))
+        return where, BlockShape(most, filled(height, LANES))
+
+    def _image_of(self, volume: Singles) -> Singles:
         _, height, width = self.shape
-        return self._products.project(kernels.turned(volume, (width, filled(height, LANES))))
+        return self.project(kernels.turned(volume, (width, filled(height, LANES))))
 
-    def adjoint(self, image: Singles) -> Singles:
-        """Return the volume [plane, row voxel, column voxel] that an image is spread back to."""
-        ensure_own_threads()
-        image = real_array(image, self.image_shape, "an image")
+    def _volume_of(self, image: Singles) -> Singles:
         planes, height, width = self.shape
-        volume = self._products.back_project(image, (planes, width, filled(height, LANES)))
-        return kernels.turned(volume, (height, width))
+        return kernels.turned(self.back_project(image, (planes, width, filled(height, LANES))), (height, width))
 
-    def column(self, plane: int, row_voxel: int, column_voxel: int) -> Column:
-        """Return the rows, columns (int64) and weights (float32) of the pixels that one voxel lights."""
-        plane, row_voxel, column_voxel = voxel_index((plane, row_voxel, column_voxel), self.shape)
+    def _column_of(self, plane: int, row_voxel: int, column_voxel: int) -> Column:
         row, along_rows = self.rows.row(plane, row_voxel)
         column, along_columns = self.columns.row(plane, column_voxel)
         by_cell = np.outer(along_rows, along_columns) * self.mask[np.ix_(row, column)]
@@ -317,21 +370,10 @@ class FactorisedOperator:
         lit = np.nonzero(weight)
         return rows[lit[0]].astype(np.int64), columns[lit[1]].astype(np.int64), weight[lit]
 
-    @cached_property
-    def _products(self) -> BlockProducts:
-        planes, height, _ = self.shape
-        blocks = []
-        for most in (PLANES_FORWARD, PLANES_BACK):
-            first = np.arange(0, planes, most)
-            where = Blocks(first, np.minimum(planes - first, most), np.zeros_like(first))
-            blocks.append((where, BlockShape(most, filled(height, LANES))))
-        order = np.arange(*lit_range(self.columns.cell), dtype=np.int32)
-        return BlockProducts(self.columns, self.rows, self.mask, order, *blocks)
-
 
 @dataclass(frozen=True, eq=False)
-class BrickOperator:
-    """The weights of an array whose rows of lenses are moved against each other, every second one alike.
+class BrickOperator(WeightsOperator):
+    """The weights of an array whose rows of lenses are moved against each other: of every second row, and the others'.
 
     Attributes
     ----------
@@ -343,24 +385,22 @@ class BrickOperator:
 
     @property
     def shape(self) -> tuple[int, int, int]:
-        """Shape of a volume: (planes, voxels along the rows, voxels along the columns)."""
         return self.even.shape
 
     @property
     def image_shape(self) -> tuple[int, int]:
-        """Shape of an image."""
         return self.even.image_shape
 
-    def forward(self, volume: Singles) -> Singles:
-        """Return the image (rows, columns) of a volume [plane, row voxel, column voxel]."""
+    def behind(self, transmission: Singles) -> BrickOperator:
+        return BrickOperator(self.even.behind(transmission), self.odd.behind(transmission))
+
+    def _image_of(self, volume: Singles) -> Singles:
         return self.even.forward(volume) + self.odd.forward(volume)
 
-    def adjoint(self, image: Singles) -> Singles:
-        """Return the volume [plane, row voxel, column voxel] that an image is spread back to."""
+    def _volume_of(self, image: Singles) -> Singles:
         return self.even.adjoint(image) + self.odd.adjoint(image)
 
-    def column(self, plane: int, row_voxel: int, column_voxel: int) -> Column:
-        """Return the rows, columns (int64) and weights (float32) of the pixels that one voxel lights."""
+    def _column_of(self, plane: int, row_voxel: int, column_voxel: int) -> Column:
         both = [each.column(plane, row_voxel, column_voxel) for each in (self.even, self.odd)]
         row, column, weight = (np.concatenate(parts) for parts in zip(*both, strict=True))
         width = self.image_shape[1]

@@ -423,7 +423,7 @@ def factorise_strips(camera: Camera, space: CurvedSpace, grid: Grid, optics: Opt
         [each.line for each in blocks],
     )
     places = Blocks(*(np.array(each, np.int64) for each in where))
-    operator = StripOperator(columns, rows, places, mask, scene.order, lit, turned, np.zeros(0))
+    operator = StripOperator(columns, rows, mask, places, scene.order, lit, turned, np.zeros(0))
     sample = sample_lit(camera, space, grid, lit, SAMPLE, np.random.default_rng(0))
     return replace(operator, misfit_l1=misfits_l1(operator, camera, space, grid, sample))
 

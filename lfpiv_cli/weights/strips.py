@@ -18,77 +18,76 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TypeVar
+from typing import Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lfpiv_cli.arrays import Flags, Floats, Singles
-from lfpiv_cli.threads import ensure_own_threads
 from lfpiv_cli.weights import kernels
-from lfpiv_cli.weights.axis import AxisWeights
 from lfpiv_cli.weights.kernels import PLACES, SLAB, STRIP, Blocks, BlockShape
-from lfpiv_cli.weights.operators import BlockProducts, Column, real_array, voxel_index
+from lfpiv_cli.weights.operators import Column, SeparatedOperator
 
 Scalar = TypeVar("Scalar", bound=np.generic)
 
 
 @dataclass(frozen=True, eq=False)
-class StripOperator:
+class StripOperator(SeparatedOperator):
     """Weights in strips.
 
     Attributes
     ----------
-    columns : a, of the planes of one block after the other; share (entries, COEFFICIENTS) by the powers of `PLACES`
-    rows : b, of the `STRIP` lines of each of these planes
+    columns, rows : a and b; share (entries, COEFFICIENTS) of the former by the powers of `PLACES`, the latter of the
+        `STRIP` lines of each plane
     blocks : where they lie; none crosses a multiple of `SLAB` planes
-    mask : (row cells, column cells) float32, C and whatever else scales the light
-    order : of the lit column cells, int32: a block may have those of some tiles only
+    order : of the lit column cells
     lit : (planes, row voxels, column voxels) which voxels have light: not those outside the fluid
     turned : the strips are of columns of voxels, and rows and columns of image and volume are exchanged but in `lit`
     misfit_l1 : (samples,) how far columns of a sample of voxels are from those of traced rays, in L1
     """
 
-    columns: AxisWeights
-    rows: AxisWeights
     blocks: Blocks
-    mask: Singles
     order: NDArray[np.int32]
     lit: Flags
     turned: bool
     misfit_l1: Floats
 
     @property
+    def lit_cells(self) -> NDArray[np.int32]:
+        """As they were sorted."""
+        return self.order
+
+    @property
+    def forward_blocks(self) -> tuple[Blocks, BlockShape]:
+        """Parts of strips."""
+        return self.blocks, BlockShape(SLAB, STRIP)
+
+    back_blocks = forward_blocks
+
+    @property
     def shape(self) -> tuple[int, int, int]:
-        """Shape of a volume: (planes, voxels along the rows, voxels along the columns)."""
         planes, rows, columns = self.lit.shape
         return planes, rows, columns
 
     @property
     def image_shape(self) -> tuple[int, int]:
-        """Shape of an image."""
-        rows, columns = self.rows.pixels, self.columns.pixels
-        return (columns, rows) if self.turned else (rows, columns)
+        return super().image_shape[::-1] if self.turned else super().image_shape
 
-    def forward(self, volume: Singles) -> Singles:
-        """Return the image (rows, columns) of a volume."""
-        ensure_own_threads()
-        lines = self._as_lines(real_array(volume, self.shape, "a volume") * self.lit)
-        image = self._products.project(kernels.turned(lines, (lines.shape[2], self._height)))
+    def behind(self, transmission: Singles) -> Self:
+        return super().behind(np.ascontiguousarray(transmission.T) if self.turned else transmission)
+
+    def _image_of(self, volume: Singles) -> Singles:
+        lines = self._as_lines(volume * self.lit)
+        image = self.project(kernels.turned(lines, (lines.shape[2], self._height)))
         return np.ascontiguousarray(image.T) if self.turned else image
 
-    def adjoint(self, image: Singles) -> Singles:
-        """Return the volume that an image is spread back to."""
-        ensure_own_threads()
-        image = real_array(image, self.image_shape, "an image")
+    def _volume_of(self, image: Singles) -> Singles:
         seen = np.ascontiguousarray(image.T) if self.turned else image
         lines, along = self._as_lines(self.lit).shape[1:]
-        volume = self._products.back_project(seen, (len(self.lit), along, self._height))
+        volume = self.back_project(seen, (len(self.lit), along, self._height))
         return np.ascontiguousarray(self._as_lines(kernels.turned(volume, (lines, along)))) * self.lit
 
-    def column(self, plane: int, row_voxel: int, column_voxel: int) -> Column:
-        """Return the rows, columns (int64) and weights (float32) of the pixels that one voxel lights."""
-        plane, row_voxel, column_voxel = voxel_index((plane, row_voxel, column_voxel), self.shape)
+    def _column_of(self, plane: int, row_voxel: int, column_voxel: int) -> Column:
         image = np.zeros(self.image_shape, np.float32)
         seen = image.T if self.turned else image
         line, along = (column_voxel, row_voxel) if self.turned else (row_voxel, column_voxel)
@@ -116,8 +115,3 @@ class StripOperator:
     def _height(self) -> int:
         """Lines with those that the last strip has beyond the volume."""
         return int(max(self.blocks.line.max(initial=0) + STRIP, self._as_lines(self.lit).shape[1]))
-
-    @cached_property
-    def _products(self) -> BlockProducts:
-        blocks = self.blocks, BlockShape(SLAB, STRIP)
-        return BlockProducts(self.columns, self.rows, self.mask, self.order, blocks, blocks)
