@@ -20,8 +20,8 @@ import click
 
 from lfpiv_cli import __version__
 from lfpiv_cli.cli import measuring, results, rig
-from lfpiv_cli.cli.options import HungUp, Terminated, outcome_of, print_json_error, printable, voice_options
-from lfpiv_cli.errors import OutputError, UsageError
+from lfpiv_cli.cli.options import HungUp, Terminated, error_record, outcome_of, print_json, printable, voice_options
+from lfpiv_cli.errors import LimitMissedError, OutputError, PartialError, UsageError
 from lfpiv_cli.files.inputs import ensure_address_space
 
 if TYPE_CHECKING:
@@ -46,41 +46,30 @@ def end_by_signals() -> None:
 
     What is ignored from the start stays so: nohup has SIGHUP ignored, shells SIGINT in the background.
     """
+
+    def unwind(number: int, _frame: FrameType | None) -> None:
+        _heard.append(number)
+        raise RAISED[number]
+
     for number in RAISED:
         if signal.getsignal(number) is not signal.SIG_IGN:
-            signal.signal(number, _unwind)
+            signal.signal(number, unwind)
     sys.unraisablehook = _send_again
-    if sys.platform != "win32":
-        _answer_at_once()
-
-
-def ended_by(error: BaseException) -> BaseException:
-    """Return what a command ends by: the first signal, whatever a library has made of it, else the error."""
-    if not _heard:
-        return error
-    _answer(_heard[0])
-    return RAISED[_heard[0]]()
-
-
-def _unwind(number: int, _frame: FrameType | None) -> None:
-    _heard.append(number)
-    raise RAISED[number]
-
-
-def _answer_at_once() -> None:
-    """Answer signals from a thread of its own: Python itself hears of them when a compiled call has returned."""
+    if sys.platform == "win32":
+        return
+    # Answered from a thread of its own: Python itself hears of a signal when a compiled call has returned.
     heard, told = os.pipe()
     os.set_blocking(told, False)
     signal.set_wakeup_fd(told, warn_on_full_buffer=False)
     # What is sent to a forked process is none of this one's.
     os.register_at_fork(after_in_child=lambda: signal.set_wakeup_fd(-1))
-    Thread(target=_listen, args=(heard,), daemon=True).start()
 
+    def listen() -> None:
+        while (number := os.read(heard, 1)[0]) not in RAISED:
+            pass
+        _answer(number)
 
-def _listen(heard: int) -> None:
-    while (number := os.read(heard, 1)[0]) not in RAISED:
-        pass
-    _answer(number)
+    Thread(target=listen, daemon=True).start()
 
 
 def _answer(number: int) -> None:
@@ -107,19 +96,6 @@ def _send_again(unraisable: UnraisableHookArgs) -> None:
 
 
 THREADS, SCREEN = "NUMBA_NUM_THREADS", "MPLBACKEND"
-
-
-def settle_environment() -> None:
-    """Refuse a number of threads that is none; forget the screen to draw on, as pictures are drawn into files.
-
-    Raises
-    ------
-    UsageError
-    """
-    os.environ.pop(SCREEN, None)
-    told = os.environ.get(THREADS)
-    if told is not None and not (told.strip().isdecimal() and int(told) > 0):
-        raise UsageError(f"{THREADS} is {told!r}, expected a number of threads from 1 on, or that it is not set")
 
 
 class Stream(io.RawIOBase):
@@ -183,18 +159,6 @@ def open_streams() -> Stream:
     return streams["stdout"]
 
 
-def ensure_said(stdout: Stream) -> None:
-    """Refuse to call a command done whose answer on stdout was lost; a reader that has gone wanted no more of it.
-
-    Raises
-    ------
-    OutputError
-    """
-    sys.stdout.flush()
-    if stdout.failure is not None and stdout.failure.errno != errno.EPIPE:
-        raise OutputError(f"stdout: cannot be written: {os.strerror(stdout.failure.errno or 0)}; all files are written")
-
-
 COMMANDS = (
     rig.init,
     rig.check,
@@ -236,18 +200,18 @@ def cli(context: click.Context, **before: Any) -> None:
 
     Options that stand before a command hold for it as those after it do.
     """
-    settle_environment()
+    # Pictures are drawn into files, on no screen.
+    os.environ.pop(SCREEN, None)
+    told = os.environ.get(THREADS)
+    if told is not None and not (told.strip().isdecimal() and int(told) > 0):
+        raise UsageError(f"{THREADS} is {told!r}, expected a number of threads from 1 on, or that it is not set")
     context.default_map = {str(context.invoked_subcommand): {name: value for name, value in before.items() if value}}
 
 
-def first_sentence(text: str) -> str:
-    """Return the first sentence of a help, on one line and without its full stop."""
-    return " ".join(text.split("\n\n")[0].split()).split(". ")[0].removesuffix(".")
-
-
 for _command in COMMANDS:
-    # click would cut what is longer than a line.
-    _command.short_help = _command.short_help or first_sentence(_command.help or "")
+    # The first sentence of its help; click would cut what is longer than a line.
+    _words = " ".join((_command.help or "").split("\n\n")[0].split())
+    _command.short_help = _command.short_help or _words.split(". ")[0].removesuffix(".")
     cli.add_command(_command)
 
 
@@ -261,15 +225,23 @@ def main() -> NoReturn:
     try:
         ensure_address_space()
         cli.main(standalone_mode=False)
-        ensure_said(stdout)
+        sys.stdout.flush()
+        lost = stdout.failure
+        # A reader that has gone wanted no more of the answer; without it otherwise no command is done.
+        if lost is not None and lost.errno != errno.EPIPE:
+            raise OutputError(f"stdout: cannot be written: {os.strerror(lost.errno or 0)}; all files are written")
         code = 0
     except SystemExit:
         raise
     except BaseException as raised:
-        error = ended_by(raised)
+        # By the first signal, whatever a library has made of it.
+        error = RAISED[_heard[0]]() if _heard else raised
+        if _heard:
+            _answer(_heard[0])
         message, code = outcome_of(error)
-        if as_json:
-            print_json_error(error)
+        if as_json and not isinstance(error, (LimitMissedError, PartialError)):
+            # One that came with figures stands in theirs already.
+            print_json(error_record(error))
         if isinstance(error, click.ClickException):
             error.show()
         elif isinstance(error, Exception) and not isinstance(error, click.Abort):

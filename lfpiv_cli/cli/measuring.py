@@ -15,6 +15,7 @@ from lfpiv_cli.cli.options import (
     background_option,
     batch_options,
     board_option,
+    calls,
     common_options,
     config_argument,
     dark_option,
@@ -103,9 +104,8 @@ def field(
 @batch_options
 @output_option("File of tracks to write (.vtkhdf), folder for several pairs.")
 @common_options
-def track(
-    particles: tuple[Path, ...], output: Path, overwrite: bool, console: Console, **chosen: Any
-) -> dict[str, Any]:
+@calls("track.track_particles", "TrackOptions", "particles", "output")
+def track() -> None:
     """Follow particles from one frame to the next, or over a sequence: particle tracking velocimetry (PTV).
 
     Two files give a displacement for each particle that is in both. More than two, in the order of time, give tracks:
@@ -120,9 +120,6 @@ def track(
     with particles from
              lfpiv reconstruct weights.h5 a.tif b.tif --dark dark.tif --solver particles -o particles
     """
-    from lfpiv_cli.verbs import track as stage
-
-    return stage.track_particles(particles, output, stage.TrackOptions(**chosen), overwrite=overwrite, console=console)
 
 
 @click.command("follow")
@@ -149,9 +146,8 @@ def track(
 @output_option("Folder for the particles of each frame and the tracks.")
 @common_options
 @raw_option
-def follow(
-    weights: Path, frames: tuple[Path, ...], output: Path, overwrite: bool, console: Console, **chosen: Any
-) -> dict[str, Any]:
+@calls("follow.follow_particles", "FollowOptions", "weights", "frames", "output")
+def follow() -> None:
     """Find and track the particles of a time-resolved sequence together, as in Shake-The-Box.
 
     The first two frames are searched as a pair. Then each track predicts where its particle is in the next frame, the
@@ -169,11 +165,6 @@ def follow(
     before the limit of a job it stops, and the same command goes on:
              lfpiv follow weights.h5 run.tif --dark dark.tif --time-limit 50m --resume -o run
     """
-    from lfpiv_cli.verbs import follow as stage
-
-    return stage.follow_particles(
-        weights, frames, output, stage.FollowOptions(**chosen), overwrite=overwrite, console=console
-    )
 
 
 def parse_windows(
@@ -213,9 +204,8 @@ def _window(text: str) -> int | tuple[int, ...]:
 @watch_options
 @output_option("File for one pair, folder for several.", required=False)
 @common_options
-def correlate(
-    volumes: tuple[Path, ...], overwrite: bool, console: Console, output: Path | None = None, **chosen: Any
-) -> dict[str, Any]:
+@calls("correlate.correlate_files", "CorrelateOptions", "volumes", "output")
+def correlate() -> None:
     """Measure the displacements between two volumes by multi-pass three-dimensional cross-correlation.
 
     From pass to pass interrogation windows get finer and the volumes are deformed by what was found; false vectors are
@@ -228,11 +218,6 @@ def correlate(
              lfpiv correlate volumes --pairing sequence --mean mean.vtkhdf -o vectors
              lfpiv correlate vectors --mean mean.vtkhdf
     """
-    from lfpiv_cli.verbs import correlate as stage
-
-    return stage.correlate_files(
-        volumes, output, stage.CorrelateOptions(**chosen), overwrite=overwrite, console=console
-    )
 
 
 @click.command("combine")
@@ -240,7 +225,8 @@ def correlate(
 @click.argument("vectors_b", type=FILE)
 @output_option("File of combined vectors to write (.vtkhdf).")
 @common_options
-def combine(vectors_a: Path, vectors_b: Path, output: Path, overwrite: bool, console: Console) -> dict[str, Any]:
+@calls("combine.combine_vectors", None, "vectors_a", "vectors_b", "output")
+def combine() -> None:
     """Weight two vector fields on one grid by their uncertainties, those of correlate and of track --grid.
 
     A vector that has none, or that disagrees with the other and with those around it, is left out; share_a is the
@@ -249,9 +235,6 @@ def combine(vectors_a: Path, vectors_b: Path, output: Path, overwrite: bool, con
     \b
     Example: lfpiv combine vectors.vtkhdf tracks_grid.vtkhdf -o combined.vtkhdf
     """
-    from lfpiv_cli.verbs import combine as stage
-
-    return stage.combine_vectors(vectors_a, vectors_b, output, overwrite=overwrite, console=console)
 
 
 def named_images(command: Callable[..., Any]) -> Callable[..., Any]:
@@ -292,14 +275,8 @@ def named_images(command: Callable[..., Any]) -> Callable[..., Any]:
 @output_option("Folder for all that is made.")
 @common_options
 @raw_option
-def run(
-    config: Path,
-    images: tuple[Path, ...],
-    output: Path,
-    overwrite: bool,
-    console: Console,
-    **chosen: Any,
-) -> dict[str, Any]:
+@calls("run.run", "RunOptions", "config", "output")
+def run() -> None:
     """Go from raw images to vectors: calibrate, build weights, measure the flow.
 
     Every step writes what its own command does, into OUTPUT. By itself it counts the tracers for each microlens, and
@@ -321,9 +298,6 @@ def run(
              lfpiv run rig.yaml images --pairing ab --white white.tif --dark dark.tif --board board.tif \\
                  --shard 2/3 --time-limit 50m -o results
     """
-    from lfpiv_cli.verbs import run as stage
-
-    return stage.run(config, output, stage.RunOptions(images=images, **chosen), overwrite=overwrite, console=console)
 
 
 @click.command("reconstruct")
@@ -353,9 +327,8 @@ def run(
 @output_option("File for one image, folder for several.")
 @common_options
 @raw_option
-def reconstruct(
-    weights: Path, images: tuple[Path, ...], output: Path, overwrite: bool, console: Console, **chosen: Any
-) -> dict[str, Any]:
+@calls("reconstruct.reconstruct_files", "ReconstructOptions", "weights", "images", "output")
+def reconstruct() -> None:
     """Reconstruct the volume of tracer particles behind each image (tomographic reconstruction).
 
     With --solver particles it finds the particles themselves by iterative particle reconstruction: each is fitted to
@@ -377,8 +350,3 @@ def reconstruct(
              lfpiv reconstruct weights.h5 images --dask local:4 -o volumes
              lfpiv reconstruct weights.h5 images --watch --idle-s 30 -o volumes
     """
-    from lfpiv_cli.verbs import reconstruct as stage
-
-    return stage.reconstruct_files(
-        weights, images, output, stage.ReconstructOptions(**chosen), overwrite=overwrite, console=console
-    )

@@ -5,8 +5,9 @@ from __future__ import annotations
 import json
 import os
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable
 from functools import wraps
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,7 +22,7 @@ from lfpiv_cli.files.shares import Shard, parse_time_limit
 from lfpiv_cli.names import InputKind, Pairing, names_in
 
 if TYPE_CHECKING:
-    from lfpiv_cli.files.atomic import EventLog
+    from lfpiv_cli.console import Console
 
 EXIT_BUG = 1
 EXIT_HUNG_UP = 129
@@ -61,12 +62,6 @@ def outcome_of(error: BaseException) -> tuple[str, int]:
 def print_json(figures: dict[str, Any]) -> None:
     """Print the one JSON object of a command to stdout; what is no number is null there."""
     click.echo(json.dumps(without_nan(figures), allow_nan=False, sort_keys=True))
-
-
-def print_json_error(error: BaseException) -> None:
-    """Print an error as the JSON object of a command; one that came with figures stands in theirs already."""
-    if not isinstance(error, (LimitMissedError, PartialError)):
-        print_json(error_record(error))
 
 
 def error_record(error: BaseException) -> dict[str, Any]:
@@ -169,13 +164,9 @@ dask_option = click.option(
 
 def watch_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """Give a command the options of folders that are still being filled."""
-    watch = click.option(
-        "--watch",
-        is_flag=True,
-        help="The folders given are still being filled: take files as they become complete, in order.",
-    )
+    help_text = "The folders given are still being filled: take files as they become complete, in order."
     idle = click.option("--idle-s", type=POSITIVE, help="With --watch, end so long after the last change; 60.")
-    return watch(idle(command))
+    return click.option("--watch", is_flag=True, help=help_text)(idle(command))
 
 
 def raw_option(command: Callable[..., Any]) -> Callable[..., Any]:
@@ -255,6 +246,23 @@ def pairing_options(command: Callable[..., Any]) -> Callable[..., Any]:
     return how(template(listed(command)))
 
 
+def calls(stage: str, options: str | None, *files: str) -> Callable[..., Any]:
+    """Have a command call a function of `verbs`: with its files, and with all else that it is given as options."""
+    module, _, function = stage.partition(".")
+
+    def with_call(command: Callable[[], None]) -> Callable[..., Any]:
+        @wraps(command)
+        def run(overwrite: bool, console: Console, **arguments: Any) -> Any:
+            verb = import_module(f"lfpiv_cli.verbs.{module}")
+            given = [arguments.pop(name, None) for name in files]
+            chosen = [] if options is None else [getattr(verb, options)(**arguments)]
+            return getattr(verb, function)(*given, *chosen, overwrite=overwrite, console=console)
+
+        return run
+
+    return with_call
+
+
 def output_option(text: str, required: bool = True) -> Callable[..., Any]:
     """Return the option -o of a command, with what it writes."""
     return click.option("-o", "--output", type=FILE, required=required, help=text)
@@ -264,11 +272,9 @@ def output_option(text: str, required: bool = True) -> Callable[..., Any]:
 OUTPUTS = ("output", "picture", "failures", "cache")
 
 
-def _inputs(arguments: Mapping[str, Any]) -> list[Path]:
-    """Return the files and folders that a command is given to read; a text may be one, too."""
-    given = [value for name, value in arguments.items() if name not in OUTPUTS]
-    flat = [each for value in given for each in (value if isinstance(value, tuple) else (value,))]
-    return [Path(each) for each in flat if isinstance(each, Path) or (isinstance(each, str) and os.path.exists(each))]
+def _flat(values: Iterable[Any]) -> list[Any]:
+    """Return the values that a command is given, each of those that are given several times."""
+    return [each for value in values for each in (value if isinstance(value, tuple) else (value,))]
 
 
 def voice_options(command: Callable[..., Any]) -> Callable[..., Any]:
@@ -308,11 +314,18 @@ def common_options(command: Callable[..., dict[str, Any]]) -> Callable[..., None
         **arguments: Any,
     ) -> None:
         from lfpiv_cli.console import Console
+        from lfpiv_cli.files.atomic import EventLog, place_of
         from lfpiv_cli.files.recordings.recording import taken_complaints
         from lfpiv_cli.notice import Notice
 
         warned: list[Notice] = []
-        log_file = None if log is None else _event_log(log, arguments)
+        log_file = None
+        if log is not None:
+            if place_of(log) in [place_of(each) for each in _flat(arguments.values()) if isinstance(each, Path)]:
+                raise UsageError(f"{log}: is the log, and another file of this command, too")
+            name = click.get_current_context().command.name or ""
+            # Of a dry run for reading alone.
+            log_file = EventLog(log, name, read_only=bool(arguments.get("dry_run")))
         console = Console(verbose=verbose, quiet=quiet, only_warnings=as_json, warned=warned, log=log_file)
         if threads is not None:
             from lfpiv_cli.threads import use_threads
@@ -325,7 +338,10 @@ def common_options(command: Callable[..., dict[str, Any]]) -> Callable[..., None
             if verify is not None:
                 from lfpiv_cli.files.listing import ensure_verified
 
-                ensure_verified(verify, _inputs(given))
+                # All that it reads; a text may name a file, too.
+                read = _flat(value for name, value in given.items() if name not in OUTPUTS)
+                texts = {each for each in read if isinstance(each, str) and os.path.exists(each)}
+                ensure_verified(verify, [Path(each) for each in read if isinstance(each, Path) or each in texts])
             summary = command(console=console, **given)
         except (LimitMissedError, PartialError) as error:
             ended_with, summary = error, error.figures
@@ -346,18 +362,3 @@ def common_options(command: Callable[..., dict[str, Any]]) -> Callable[..., None
             raise ended_with
 
     return run
-
-
-def _event_log(path: Path, arguments: Mapping[str, Any]) -> EventLog:
-    """Return the log of a command, of a dry run for reading alone.
-
-    Raises
-    ------
-    UsageError : it would lie in the place of another file of the command
-    """
-    from lfpiv_cli.files.atomic import EventLog, place_of
-
-    values = [each for value in arguments.values() for each in (value if isinstance(value, tuple) else (value,))]
-    if place_of(path) in [place_of(other) for other in values if isinstance(other, Path)]:
-        raise UsageError(f"{path}: is the log, and another file of this command, too")
-    return EventLog(path, click.get_current_context().command.name or "", read_only=bool(arguments.get("dry_run")))

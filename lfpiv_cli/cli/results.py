@@ -11,6 +11,7 @@ import click
 from lfpiv_cli.cli.options import (
     FILE,
     POSITIVE,
+    calls,
     common_options,
     config_argument,
     output_option,
@@ -133,7 +134,8 @@ def _refuse_misplaced(what: str, chosen: dict[str, Any]) -> None:
 @click.option("--raw", type=FILE, multiple=True, help="Raw images, white ones too, to show what was found on them.")
 @output_option("Page to write (.html).")
 @common_options
-def report(folder: Path, output: Path, overwrite: bool, console: Console, **chosen: Any) -> dict[str, Any]:
+@calls("report.report", "ReportOptions", "folder", "output")
+def report() -> None:
     """Make one page of a folder of results: verdict, pictures, figures, settings and warnings.
 
     It needs no truth, holds all its pictures and loads nothing, so that it can be handed on as it is; tracks can be
@@ -143,9 +145,6 @@ def report(folder: Path, output: Path, overwrite: bool, console: Console, **chos
     Example: lfpiv report results -o results/report.html
              lfpiv report results --raw a.tif --raw white.tif -o results/report.html
     """
-    from lfpiv_cli.verbs import report as stage
-
-    return stage.report(folder, output, stage.ReportOptions(**chosen), overwrite=overwrite, console=console)
 
 
 @click.command("export")
@@ -157,9 +156,8 @@ def report(folder: Path, output: Path, overwrite: bool, console: Console, **chos
 )
 @output_option("File to write; beside FILE and named like it when not given.", required=False)
 @common_options
-def export(
-    files: tuple[Path, ...], overwrite: bool, console: Console, output: Path | None = None, **chosen: Any
-) -> dict[str, Any]:
+@calls("export.export", "ExportOptions", "files", "output")
+def export() -> None:
     """Write vectors, volumes, particles or tracks in the format of another program, to the last bit.
 
     \b
@@ -176,9 +174,6 @@ def export(
              lfpiv export vectors/*.vtkhdf --to vtkhdf-series --step-s 0.002 -o series.vtkhdf
              lfpiv export tracks.vtkhdf --to mat -o tracks.mat
     """
-    from lfpiv_cli.verbs import export as stage
-
-    return stage.export(files, output, stage.ExportOptions(**chosen), overwrite=overwrite, console=console)
 
 
 @click.command("info")
@@ -187,7 +182,8 @@ def export(
 @click.option("--voxel", type=int, nargs=3, metavar="IX IY IZ", help="weights: which voxel; default the middle one.")
 @common_options
 @raw_option
-def info(file: Path, overwrite: bool, console: Console, **chosen: Any) -> dict[str, Any]:
+@calls("plot.info", "InfoOptions", "file")
+def info() -> None:
     """Describe a file that lfpiv wrote, or a recording; of weights, draw the point-spread function of one voxel.
 
     \b
@@ -195,9 +191,6 @@ def info(file: Path, overwrite: bool, console: Console, **chosen: Any) -> dict[s
     of a camera's recording, its pages, size, bits and frame rate:
              lfpiv info shot.cine
     """
-    from lfpiv_cli.verbs import plot as stage
-
-    return stage.info(file, stage.InfoOptions(**chosen), overwrite=overwrite, console=console)
 
 
 @click.command("plot")
@@ -208,16 +201,14 @@ def info(file: Path, overwrite: bool, console: Console, **chosen: Any) -> dict[s
     "--raw", type=FILE, help="Image to draw on: the raw one that particles were found in, a calibration's white image."
 )
 @common_options
-def plot(file: Path, output: Path, overwrite: bool, console: Console, **chosen: Any) -> dict[str, Any]:
+@calls("plot.plot", "PlotOptions", "file", "output")
+def plot() -> None:
     """Draw what is in a file: vectors, tracks, particles, a volume, a calibration or weights.
 
     \b
     Example: lfpiv plot vectors.vtkhdf -o vectors.pdf
     Example: lfpiv plot vectors.vtkhdf --only planes -o planes.png
     """
-    from lfpiv_cli.verbs import plot as stage
-
-    return stage.plot(file, output, stage.PlotOptions(**chosen), overwrite=overwrite, console=console)
 
 
 @click.command("warm-up")

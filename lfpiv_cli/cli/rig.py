@@ -9,19 +9,25 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
-from lfpiv_cli.cli.options import FILE, POSITIVE, common_options, config_argument, dark_option, raw_option
+from lfpiv_cli.cli.options import (
+    FILE,
+    POSITIVE,
+    board_option,
+    calls,
+    common_options,
+    config_argument,
+    dark_option,
+    depth_option,
+    output_option,
+    raw_option,
+    white_option,
+)
 from lfpiv_cli.console import Console
-from lfpiv_cli.names import KnownCamera, names_in
+from lfpiv_cli.errors import UsageError
+from lfpiv_cli.names import KnownCamera, Method, Refraction, Sampling, names_in
 
 if TYPE_CHECKING:
     from lfpiv_cli.files.rig_numbers import RigNumbers
-from lfpiv_cli.cli.options import (
-    board_option,
-    depth_option,
-    output_option,
-    white_option,
-)
-from lfpiv_cli.names import Method, Refraction, Sampling
 
 
 @click.command("build-weights")
@@ -35,18 +41,14 @@ from lfpiv_cli.names import Method, Refraction, Sampling
 @click.option("--dry-run", is_flag=True, help="Check everything and estimate time and memory; write nothing.")
 @output_option("Weights file to write (.h5).")
 @common_options
-def build_weights(config: Path, output: Path, overwrite: bool, console: Console, **chosen: Any) -> dict[str, Any]:
+@calls("build_weights.build_weights_file", "BuildWeightsOptions", "config", "output")
+def build_weights() -> None:
     """Calculate how every voxel lights every pixel: its point-spread function behind main lens and microlenses.
 
     \b
     Example: lfpiv build-weights rig.yaml --calibration calibration.h5 -o weights.h5
              lfpiv build-weights rig.yaml --calibration calibration.h5 -o weights.h5 --dry-run
     """
-    from lfpiv_cli.verbs import build_weights as stage
-
-    return stage.build_weights_file(
-        config, output, stage.BuildWeightsOptions(**chosen), overwrite=overwrite, console=console
-    )
 
 
 @click.command("calibrate-snapshot")
@@ -60,7 +62,8 @@ def build_weights(config: Path, output: Path, overwrite: bool, console: Console,
 @click.option("--views", type=FILE, help="Picture of views and refocused depths to write (.png).")
 @common_options
 @raw_option
-def calibrate_snapshot(config: Path, output: Path, overwrite: bool, console: Console, **chosen: Any) -> dict[str, Any]:
+@calls("calibrate.calibrate_snapshot", "CalibrateOptions", "config", "output")
+def calibrate_snapshot() -> None:
     """Find microlenses and focal plane from a white image and one snapshot of a calibration target.
 
     \b
@@ -72,11 +75,6 @@ def calibrate_snapshot(config: Path, output: Path, overwrite: bool, console: Con
     without a target, with a camera known to be focused on the channel's mid plane:
              lfpiv calibrate-snapshot rig.yaml --white white.tif --depth-mm 0 -o calibration.h5
     """
-    from lfpiv_cli.verbs import calibrate as stage
-
-    return stage.calibrate_snapshot(
-        config, output, stage.CalibrateOptions(**chosen), overwrite=overwrite, console=console
-    )
 
 
 @click.command("refine-calibration")
@@ -89,9 +87,8 @@ def calibrate_snapshot(config: Path, output: Path, overwrite: bool, console: Con
 @click.option("--picture", type=FILE, help="Picture of the particles and the walls they end at to write (.png).")
 @common_options
 @raw_option
-def refine_calibration(
-    config: Path, images: tuple[Path, ...], calibration: Path, overwrite: bool, console: Console, **chosen: Any
-) -> dict[str, Any]:
+@calls("refine.refine_calibration", "RefineOptions", "config", "images", "calibration")
+def refine_calibration() -> None:
     """Correct a calibration by the tracers of a flow: volume self-calibration.
 
     The particles end at the channel's walls, which gives the mid plane, and their images say how far the lens images
@@ -102,11 +99,6 @@ def refine_calibration(
     Example: lfpiv refine-calibration rig.yaml a.tif b.tif --calibration calibration.h5 --dark dark.tif \\
                  -o refined.h5 --picture walls.png
     """
-    from lfpiv_cli.verbs import refine as stage
-
-    return stage.refine_calibration(
-        config, images, calibration, stage.RefineOptions(**chosen), overwrite=overwrite, console=console
-    )
 
 
 RIG = Path("rig.yaml")
@@ -143,7 +135,6 @@ def init(
              lfpiv init --from calibration.h5 -o again.yaml
              lfpiv init --schema -o rig.schema.json
     """
-    from lfpiv_cli.errors import UsageError
     from lfpiv_cli.files.atomic import ensure_writable
     from lfpiv_cli.verbs import init as stage
 
@@ -168,7 +159,8 @@ def init(
 @click.option("--picture", type=FILE, help="Picture of errors and field of view by depth to write (.png).")
 @common_options
 @raw_option
-def check(config: Path, images: tuple[Path, ...], overwrite: bool, console: Console, **chosen: Any) -> dict[str, Any]:
+@calls("check.check", "CheckOptions", "config", "images")
+def check() -> None:
     """Tell what a rig and its images are good for, in seconds, before any work.
 
     Each line has its verdict: good; look, worth a look; no, it cannot work so; or unknown, where nobody can tell. The
@@ -180,9 +172,6 @@ def check(config: Path, images: tuple[Path, ...], overwrite: bool, console: Cons
              lfpiv check rig.yaml a.tif b.tif --white white.tif --dark dark.tif
              lfpiv check rig.yaml a.tif b.tif --calibration calibration.h5 --dark dark.tif
     """
-    from lfpiv_cli.verbs import check as stage
-
-    return stage.check(config, images, stage.CheckOptions(**chosen), overwrite=overwrite, console=console)
 
 
 def _asked() -> RigNumbers:
