@@ -148,14 +148,14 @@ def test_what_was_interrupted_goes_on(
     rig: Path, followed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """As if it had not been, on other threads; so does what has lost a file."""
-    put = stage.FrameFiles.put
+    make = stage.Way.make
 
-    def broken(self: Any, number: int, *rest: Any) -> None:
+    def broken(self: Any, number: int, work: Any) -> None:
         if number == 2:
             raise RuntimeError("power cut")
-        put(self, number, *rest)
+        make(self, number, work)
 
-    monkeypatch.setattr(stage.FrameFiles, "put", broken)
+    monkeypatch.setattr(stage.Way, "make", broken)
     options = stage.FollowOptions(dark=rig / "dark.tif")
     with pytest.raises(RuntimeError, match="power cut"):
         stage.follow_particles(rig / "weights.h5", images(rig), tmp_path / "run", options)

@@ -8,8 +8,7 @@ was found on the way forwards.
 from __future__ import annotations
 
 import hashlib
-import time
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
@@ -34,16 +33,16 @@ from lfpiv_cli.files.exports.vtk import write_playback
 from lfpiv_cli.files.pairing import in_order
 from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, Points, no_points, read_points, write_points
 from lfpiv_cli.files.provenance import even_step_s, record, sha256, with_warnings
-from lfpiv_cli.files.shares import Deadline
+from lfpiv_cli.files.shares import awaited
+from lfpiv_cli.files.weights_file import WeightsFile
 from lfpiv_cli.notice import Notice
 from lfpiv_cli.particles.neighbour_frames import STEPS as PREDICTED_STEPS
-from lfpiv_cli.reconstruction.images import Image
 from lfpiv_cli.reference import Reference
 from lfpiv_cli.tracks.candidates import Trajectories
 from lfpiv_cli.verbs import particles
-from lfpiv_cli.verbs.batches import ALL, Batch, Failure, Worked, WorkOptions, dry_run
+from lfpiv_cli.verbs.batches import ALL, Batch, BatchOptions, Failure, WorkOptions, dry_run, work_through
 from lfpiv_cli.verbs.checks import few_notices
-from lfpiv_cli.verbs.following import SHORTEST, Recorded, ensure_sequence, forwards, go_both_ways
+from lfpiv_cli.verbs.following import SHORTEST, BothWays, Forwards, Recorded, ensure_sequence
 from lfpiv_cli.verbs.frames import (
     ImageOptions,
     bench_of,
@@ -61,77 +60,6 @@ from lfpiv_cli.verbs.reconstruct import file_notices
 from lfpiv_cli.verbs.tracers import size_notices
 from lfpiv_cli.verbs.track import SeenFrames, stored_tracks
 from lfpiv_cli.verbs.tracks import Tracking, tracking_of
-
-
-@dataclass(eq=False)
-class PlannedFrames(Batch[None]):
-    """The frames of a sequence that can be read before any is followed, as `dry_run` asks of them."""
-
-    targets: Sequence[Target]
-    inputs: Sequence[Path]
-    overwrite: bool
-    beside: Sequence[Path]
-    left_out: Sequence[Failure]
-    label = "follow"
-    unit = "frame"
-
-
-@dataclass(eq=False)
-class FrameFiles:
-    """A store of one file for each frame, written as it is found.
-
-    Attributes
-    ----------
-    targets : where the frames' files go
-    needed, there : the numbers of those that are to be made, and of all that there are
-    said : what is said of all of them
-    """
-
-    targets: Sequence[Target]
-    needed: Collection[int]
-    there: Collection[int]
-    reference: Reference
-    said: Sequence[Notice]
-    residuals: bool
-    overwrite: bool
-    work: Frames
-    deadline: Deadline
-    put_so_far: int = 0
-    begun_s: float = 0.0
-
-    def read(self, number: int) -> Points:
-        """Return the particles of a frame; none of one that was left out."""
-        if number not in self.there:
-            return no_points(PARTICLES_FORMAT, self.reference)
-        return read_points(self.targets[number].path, PARTICLES_FORMAT)
-
-    def made(self, number: int) -> Points | None:
-        """Return the particles of a frame that was complete; begin another one where there is time for it.
-
-        Raises
-        ------
-        StoppedEarlyError : there is none
-        """
-        if number not in self.needed:
-            return self.read(number)
-        if not self.deadline.leaves_time():
-            done = len(self.there) - len(self.needed) + self.put_so_far
-            raise self.deadline.error(done, len(self.there), "frame")
-        self.begun_s = time.monotonic()
-        return None
-
-    def put(self, number: int, points: Points, left: Image, notices: list[Notice]) -> None:
-        """Write the particles of a frame, what is left of its image before them: what is complete has both."""
-        target = self.targets[number]
-        self.work.console.warn(notices)
-        if self.residuals:
-            image_files.write_tiff(residual_path(target.path), left, overwrite=True)
-        told = replace(points, provenance=with_warnings(target.record, [*self.said, *notices]))
-        write_points(target.path, PARTICLES_FORMAT, told, overwrite=self.overwrite)
-        self.deadline.took(time.monotonic() - self.begun_s)
-        self.put_so_far += 1
-        self.work.done(target.path.stem)
-
 
 SEQUENCE_IS_WHOLE = "--shard: a sequence is followed from frame to frame and cannot be divided; leave out --shard"
 PARTICLES, FORWARDS = "particles", "forwards"
@@ -161,6 +89,67 @@ class FollowOptions(ImageOptions, WorkOptions):
 NO_OPTIONS = FollowOptions()
 
 
+class Way(Batch[None]):
+    """One way through a sequence: the particles of each frame that can be read, in a file of its own.
+
+    Attributes
+    ----------
+    finder, said : what finds the particles of a frame, and what is said of all frames; known before any is made
+    reference : the origin of the particles' coordinates
+    failed : frames whose particles could not be found
+    """
+
+    label, unit = "follow", "frame"
+    order: Sequence[int] = ()
+    finder: Forwards | BothWays
+    said: Sequence[Notice] = ()
+    reference: Reference
+
+    def __init__(
+        self, targets: Sequence[Target], order: Sequence[int], inputs: Sequence[Path], overwrite: bool, resume: bool
+    ) -> None:
+        """Take where the files of all frames go, and which of these there are."""
+        self.targets, self.order, self.inputs, self.overwrite = targets, order, inputs, overwrite
+        self._replace, self.residuals = overwrite or resume, False
+        self.failed: set[int] = set()
+
+    def ensure_residuals(self, numbers: Sequence[int]) -> None:
+        """Refuse residual images that could not be written."""
+        for number in numbers if self.residuals else ():
+            ensure_writable(residual_path(self.targets[number].path), self._replace, self.inputs)
+
+    def begin(self, numbers: Sequence[int], console: Console) -> float:
+        """Return the steps of a frame: only the first two are searched from nothing."""
+        self.ensure_residuals(numbers)
+        searched = sum(number < 2 for number in numbers) if isinstance(self.finder, Forwards) else 0
+        steps = searched * particles.STEPS + (len(numbers) - searched) * PREDICTED_STEPS
+        return steps / max(len(numbers), 1)
+
+    def make(self, number: int, work: Frames) -> None:
+        """Write the particles of a frame, what is left of its image before them: what is complete has both."""
+        target = self.targets[number]
+        try:
+            points, left, notices = self.finder.find(number, work.advance)
+        except InputError:
+            self.failed.add(number)
+            raise
+        work.console.warn(notices)
+        if self.residuals:
+            image_files.write_tiff(residual_path(target.path), left, overwrite=True)
+        told = replace(points, provenance=with_warnings(target.record, [*self.said, *notices]))
+        write_points(target.path, PARTICLES_FORMAT, told, overwrite=self._replace)
+
+    def read(self, number: int) -> Points:
+        """Return the particles of a frame; none of one that was left out."""
+        path = self.targets[number].path
+        if number not in self.order or number in self.failed:
+            return no_points(PARTICLES_FORMAT, self.reference)
+        if not path.exists():
+            with awaited(path):  # another worker makes it now
+                pass
+        return read_points(path, PARTICLES_FORMAT)
+
+
 def follow_particles(
     weights: Path,
     images: Sequence[Path],
@@ -180,14 +169,13 @@ def follow_particles(
     """
     if options.shard != ALL:
         raise UsageError(SEQUENCE_IS_WHOLE)
-    frames = frames_of(images, options.keep_going)
+    frames, replacing = frames_of(images, options.keep_going), overwrite or options.resume
     ensure_sequence(len(frames), options.shortest)
     if options.failures is not None:
-        ensure_writable(options.failures, overwrite or options.resume, images)
+        ensure_writable(options.failures, replacing, images)
     order, notices = in_order(images_seen(frames))
     frames = [frames[number] for number in order]
     console.warn(notices)
-    level, common = options.level, options.files(weights)
     content = open_weights_that_fit(weights)
     settings = carried_config(content.provenance, weights).overridden("reconstruction", solver="particles")
     settings = settings.overridden("correlation", dt_s=options.dt_s)
@@ -197,72 +185,70 @@ def follow_particles(
         settings = settings.overridden("correlation", dt_s=even_step_s(steps, names))
     console.warn(frames_dt_notices(settings.correlation.dt_s, frames))
     tracking = tracking_of(settings, options.search_voxel, options.shortest, len(frames), str(weights))
-    shape = content.image_shape
     left_out: list[Failure] = []
     if options.keep_going:
-        frames, left_out = _readable(frames, shape)
+        frames, left_out = _readable(frames, content.image_shape)
         console.warn(Notice("frame-failed", each.name, each.error, "leave it out, or mend it") for each in left_out)
         ensure_sequence(len(frames), options.shortest)
-    words = other_frames(level, frames, options.mask)
-    passes = _passes(output, frames, words, settings, tracking, common, options.both_ways)
-    inputs = [*common.values(), *images]
+    ways = _ways(output, frames, settings, tracking, (weights, images), options, overwrite)
+    last, there, results = ways[-1], ways[-1].order, [output / TRACKS, output / PLAYBACK]
+    last.left_out, last.beside = left_out, [*results, *(path for way in ways[:-1] for path in way.outputs)]
     if options.dry_run:
-        beside = [output / TRACKS, output / PLAYBACK, *(target.path for targets in passes[:-1] for target in targets)]
-        here = [target for target, frame in zip(passes[-1], frames, strict=True) if frame.fault is None]
-        return dry_run(PlannedFrames(here, inputs, overwrite, beside, left_out), options, console)
-    content = searchable_weights(weights, content, settings)
-    there = [number for number, frame in enumerate(frames) if frame.fault is None]
-    # It is known that what is to be made can be written.
-    replacing, needed = overwrite or options.resume, []
-    for targets in passes:
-        needed.append([there[k] for k in pending([targets[k] for k in there], inputs, overwrite, options.resume)])
-        for number in needed[-1] if options.residuals and targets is passes[-1] else []:
-            ensure_writable(residual_path(targets[number].path), replacing, inputs)
-    for name in (TRACKS, PLAYBACK):
-        ensure_writable(output / name, replacing, inputs)
+        return dry_run(last, options, console)
+    for path in results:
+        ensure_writable(path, replacing, last.inputs)
+    if last is not ways[0]:
+        # What is made the second time can be written, which is to be known before the first.
+        there_again = pending([last.targets[k] for k in there], last.inputs, overwrite, options.resume, dry=True)
+        last.ensure_residuals([there[k] for k in there_again])
+    sequence, said = _recorded(weights, content, settings, tracking, frames, ways[0], options, console)
+
+    chosen = BatchOptions(
+        resume=options.resume,
+        keep_going=options.keep_going,
+        time_limit_s=options.time_limit_s,
+        begun_s=options.begun_s,
+    )
+    forwards = Forwards(sequence, ways[0].read)
+    found: Trajectories | None = None
+    for way in ways:
+        way.said, way.reference = said, content.reference
+        way.finder = forwards if way is ways[0] else BothWays(sequence, forwards.found(), ways[0].read)
+        worked = work_through(way, replace(chosen, failures=options.failures if way is last else None), console)
+    if not options.both_ways:
+        found = forwards.found()
+    counts = {"frames": len(frames), "found": len(worked.outcomes), "skipped": worked.skipped}
+    summary = _write_tracks(output, sequence, last, found, replacing, console)
+    return worked.ensure_whole(counts | summary | sequence.size.summary(), "frame")
+
+
+def _recorded(
+    weights: Path,
+    content: WeightsFile,
+    settings: Config,
+    tracking: Tracking,
+    frames: Sequence[Frame],
+    way: Way,
+    options: FollowOptions,
+    console: Console,
+) -> tuple[Recorded, list[Notice]]:
+    """Return the sequence as it is followed, its tracers' size known; and what is said of that."""
+    content, shape = searchable_weights(weights, content, settings), content.image_shape
     dark = options.dark_image(shape)
     pitch_px = float(content.camera.micro_image_lattice_px().pitch.max())
     bench = bench_of(content, settings, dark, mask_of(options.mask, frames, shape, pitch_px, options.keep_going))
-    read = reader(level, frames, shape, dark, options.keep_going)
-    bench, size = particles.sized(bench, (particles.frame_of(bench, *read(k)) for k in there))
+    read = reader(options.level, frames, shape, dark, options.keep_going)
+    bench, size = particles.sized(bench, (particles.frame_of(bench, *read(k)) for k in way.order))
     said = size_notices(settings, size)
     console.warn(said)
 
     def frame_at(number: int) -> particles.Frame:
         (raw, lit), stem = read(number), frames[number].stem
         check_frame(bench, raw, str(frames[number].path))
-        console.warn([*file_notices(passes[0][number].record, stem), *frame_notices(bench, raw, lit, stem)])
+        console.warn([*file_notices(way.targets[number].record, stem), *frame_notices(bench, raw, lit, stem)])
         return particles.frame_of(bench, raw, lit)
 
-    sequence = Recorded(bench, size, tracking, frame_at, [frame.stem for frame in frames], {})
-    found: Trajectories | None
-    count, deadline = sum(map(len, needed)), options.deadline()
-    searched = sum(number < 2 for number in needed[0])
-    work_steps = searched * particles.STEPS + (count - searched) * PREDICTED_STEPS
-    with console.frames(count, work_steps / max(count, 1), "follow") as work:
-        stores = [
-            FrameFiles(
-                targets,
-                set(numbers),
-                set(there),
-                content.reference,
-                said,
-                options.residuals and targets is passes[-1],
-                overwrite,
-                work,
-                deadline,
-            )
-            for targets, numbers in zip(passes, needed, strict=True)
-        ]
-        found = forwards(sequence, stores[0], work.advance)
-        if options.both_ways:
-            go_both_ways(sequence, found, stores[0].read, stores[1], work.advance)
-            found = None
-    counts = {"frames": len(frames), "found": len(needed[-1]), "skipped": len(there) - len(needed[-1])}
-    summary = _write_tracks(output, sequence, stores[-1], found, replacing, console)
-    worked = Worked(dict.fromkeys(there), failures=left_out)
-    worked.list_failures(options.failures)
-    return worked.ensure_whole(counts | summary | size.summary(), "frame")
+    return Recorded(bench, size, tracking, frame_at, [frame.stem for frame in frames], {}), said
 
 
 def _readable(frames: Sequence[Frame], shape: tuple[int, int]) -> tuple[list[Frame], list[Failure]]:
@@ -288,15 +274,16 @@ def _readable(frames: Sequence[Frame], shape: tuple[int, int]) -> tuple[list[Fra
 
 
 def _write_tracks(
-    output: Path, sequence: Recorded, store: FrameFiles, found: Trajectories | None, overwrite: bool, console: Console
+    output: Path, sequence: Recorded, way: Way, found: Trajectories | None, overwrite: bool, console: Console
 ) -> dict[str, Any]:
     """Write the tracks through a sequence; return what is told of them."""
-    settings, tracking, there = sequence.bench.settings, sequence.tracking, sorted(store.there)
-    first = store.read(0)
-    carried = carried_config(first.provenance, store.targets[0].path)
-    inputs = {f"particles_{number:04d}": store.targets[number].path for number in there}
+    settings, tracking = sequence.bench.settings, sequence.tracking
+    there = [number for number in way.order if number not in way.failed]
+    first = way.read(there[0])
+    carried = carried_config(first.provenance, way.targets[there[0]].path)
+    inputs = {f"particles_{number:04d}": way.targets[number].path for number in there}
     provenance = record("follow", carried.resolved() | tracking.told(), inputs)
-    frames = SeenFrames(len(sequence.names), store.read)
+    frames = SeenFrames(len(sequence.names), way.read)
     with stored_tracks(frames, first.reference, settings, tracking, provenance, output, found) as result:
         counts = [frames.particles(number) for number in there]
         notices = few_notices(counts, [sequence.names[number] for number in there], result.summary, result.points)
@@ -307,36 +294,38 @@ def _write_tracks(
     return {"particles_fewest": min(counts)} | {k: v for k, v in result.summary.items() if k != "frames"}
 
 
-def _passes(
+def _ways(
     output: Path,
     frames: Sequence[Frame],
-    words: Callable[[int], str],
     settings: Config,
     tracking: Tracking,
-    common: Mapping[str, Path],
-    both_ways: bool,
-) -> list[list[Target]]:
-    """Return for each pass where the files of its frames go, and the records that they carry.
+    given: tuple[Path, Sequence[Path]],
+    options: FollowOptions,
+    overwrite: bool,
+) -> list[Way]:
+    """Return the ways through a sequence, of weights and images as `given`, with the records of their files.
 
     These say which frames each is made with: on the way forwards those before it (the first with the second), the
-    second time all; `words` says what their background and mask are made of.
+    second time all.
     """
+    common, words = options.files(given[0]), other_frames(options.level, frames, options.mask)
     every = ["left out\n" if frame.fault else f"{sha256(frame.path)} {frame.page}\n" for frame in frames]
-    resolved = settings.resolved()
+    resolved, there = settings.resolved(), [number for number, frame in enumerate(frames) if frame.fault is None]
 
-    def target(path: Path, number: int, way: str, count: int) -> Target:
+    def made(number: int, name: str, count: int) -> dict[str, Any]:
         frame, digest = frames[number], hashlib.sha256("".join(every[:count]).encode()).hexdigest()
         command = (
-            f"follow {way} page {frame.page} of {count} frames, SHA-256 {digest}, within {tracking.search_mm:g} mm"
+            f"follow {name} page {frame.page} of {count} frames, SHA-256 {digest}, within {tracking.search_mm:g} mm"
         )
-        inputs, taken_s = {**common, "image": frame.path}, {"image": frame.time_s}
-        return Target(path, partial(record, command + words(number), resolved, inputs, taken_s))
+        return record(command + words(number), resolved, {**common, "image": frame.path}, {"image": frame.time_s})
 
-    stems, numbers = [frame.stem for frame in frames], range(len(frames))
-    folder = output / (FORWARDS if both_ways else PARTICLES)
-    paths = output_paths(folder, stems)
-    passes = [[target(paths[k], k, "forwards", max(k + 1, 2)) for k in numbers]]
-    if both_ways:
-        paths = output_paths(output / PARTICLES, stems)
-        passes.append([target(paths[k], k, "both ways", len(frames)) for k in numbers])
-    return passes
+    ways = []
+    names = {FORWARDS: "forwards", PARTICLES: "both ways"} if options.both_ways else {PARTICLES: "forwards"}
+    for folder, name in names.items():
+        targets = [
+            Target(path, partial(made, k, name, max(k + 1, 2) if name == "forwards" else len(frames)))
+            for k, path in enumerate(output_paths(output / folder, [frame.stem for frame in frames]))
+        ]
+        ways.append(Way(targets, there, [*common.values(), *given[1]], overwrite, options.resume))
+    ways[-1].residuals = options.residuals
+    return ways

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from typing import Any, Protocol
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -125,44 +125,23 @@ def follow(
     warn_of(size_notices(chosen, size))
     provenance = record("follow", chosen.resolved() | tracking.told(), {})
     sequence = Recorded(bench, size, tracking, frame, names, provenance)
-    store = Memory()
-    forward = forwards(sequence, store)
-    found: Trajectories | None = forward
+    particles: list[Points] = []
+    way: Forwards | BothWays = (forwards := Forwards(sequence, particles.__getitem__))
+    notices: list[Notice] = []
+    for number in range(len(images)):
+        points, _, said = way.find(number)
+        particles.append(points)
+        notices += said
+    found: Trajectories | None = forwards.found()
     if both_ways:
-        before, store, found = store, Memory(), None
-        go_both_ways(sequence, forward, before.particles.__getitem__, store)
-    warn_of(store.notices)
-    particles = [store.particles[number] for number in range(len(images))]
+        way = BothWays(sequence, forwards.found(), particles.__getitem__)
+        again = [way.find(number) for number in range(len(images))]
+        particles, found = [points for points, _, _ in again], None
+        notices = [notice for _, _, said in again for notice in said]
+    warn_of(notices)
     tracks = tracked(particles, chosen, tracking, provenance, found)
     warn_of(few_notices([len(points.position_mm) for points in particles], names, tracks.summary, tracks.points))
     return Followed(particles, tracks)
-
-
-class Store(Protocol):
-    """Where the particles of frames are put as they are found."""
-
-    def made(self, number: int) -> Points | None:
-        """Return the particles of a frame that were found before, None where they were not."""
-
-    def put(self, number: int, points: Points, left: Image, notices: list[Notice]) -> None:
-        """Take the particles of a frame, what they leave of its image, and what is said of it."""
-
-
-@dataclass(eq=False)
-class Memory:
-    """A store that forgets what is left of images."""
-
-    particles: dict[int, Points] = field(default_factory=dict)
-    notices: list[Notice] = field(default_factory=list)
-
-    def made(self, number: int) -> Points | None:
-        """Return the particles of a frame that were put here."""
-        return self.particles.get(number)
-
-    def put(self, number: int, points: Points, left: Image, notices: list[Notice]) -> None:
-        """Keep particles and notices."""
-        self.particles[number] = points
-        self.notices += notices
 
 
 def ensure_sequence(frames: int, shortest: int) -> None:
@@ -198,48 +177,56 @@ class Recorded:
     provenance: dict[str, Any]
 
 
-def forwards(sequence: Recorded, store: Store, progress: Progress | None = None) -> Trajectories:
-    """Find the particles of each frame with those of the frames before it; return how they belong together.
+# The particles of a frame, what they leave of its image (rows, columns), and what is said of it.
+Found = tuple[Points, Image, list[Notice]]
 
-    The first two frames help each other. Only the last few frames are held in memory.
+
+class Forwards:
+    """The first way through a sequence: each frame is found with those before it, the first two help each other.
+
+    Only the last few frames are held in memory.
     """
-    bench, tracking = sequence.bench, sequence.tracking
-    recent: dict[int, Seen] = {}
-    so_far: SoFar | None = None
-    first_two: list[Particles] = []
-    for number in range(len(sequence.names)):
-        points = store.made(number)
-        if points is None:
-            frame = sequence.frame(number)
-            notices: list[Notice] = []
-            if so_far is None or number < 2:
-                if not first_two:
-                    two = [sequence.frame(k) for k in range(2)]
-                    own = [find_first(bench, each, progress) for each in two]
-                    first_two = [find_beside(bench, two[k], own[k], [own[1 - k]]) for k in range(2)]
-                found = first_two[number]
+
+    def __init__(self, sequence: Recorded, read: Callable[[int], Points]) -> None:
+        """Take the sequence, and what gives the particles of a frame that were found before."""
+        self._sequence, self._read = sequence, read
+        self._recent: dict[int, Seen] = {}
+        self._so_far: SoFar | None = None
+        self._first_two: list[Particles] = []
+
+    def find(self, number: int, progress: Progress | None = None) -> Found:
+        """Find the particles of a frame; those of all frames before it are known."""
+        sequence, bench, frame = self._sequence, self._sequence.bench, self._sequence.frame(number)
+        if number < 2:
+            if not self._first_two:
+                two = [sequence.frame(k) for k in range(2)]
+                own = [find_first(bench, each, progress) for each in two]
+                self._first_two = [find_beside(bench, two[k], own[k], [own[1 - k]]) for k in range(2)]
+            return _made(sequence, number, frame, self._first_two[number], [])
+        return _made(sequence, number, frame, *_next(sequence, number, frame, self._up_to(number).ahead, progress))
+
+    def found(self) -> Trajectories:
+        """Return how the particles of all frames belong together."""
+        return self._up_to(len(self._sequence.names)).found
+
+    def _up_to(self, number: int) -> SoFar:
+        """Link the particles of the frames before one."""
+        tracking, recent, so_far = self._sequence.tracking, self._recent, self._so_far
+        for k in range(0 if so_far is None else so_far.last + 1, number):
+            recent[k] = seen_in(self._read(k))
+            recent.pop(k - LOOKED_BACK, None)
+            if so_far is None:
+                so_far = begun(recent)
             else:
-                found, notices = _next(sequence, number, frame, so_far.ahead, progress)
-            points = _put(sequence, store, number, frame, found, notices)
-        recent[number] = seen_in(points)
-        recent.pop(number - LOOKED_BACK, None)
+                so_far = followed_further(so_far, recent, tracking.search_mm, tracking.scale)
         if so_far is None:
-            so_far = begun(recent)
-        else:
-            so_far = followed_further(so_far, recent, tracking.search_mm, tracking.scale)
-    if so_far is None:
-        raise ValueError("a sequence has frames")
-    return so_far.found
+            raise ValueError("a sequence has frames")
+        self._so_far = so_far
+        return so_far
 
 
-def go_both_ways(
-    sequence: Recorded,
-    found: Trajectories,
-    forward: Callable[[int], Points],
-    store: Store,
-    progress: Progress | None = None,
-) -> None:
-    """Find the particles of each frame again, where their tracks before and after it let expect them.
+class BothWays:
+    """The second way: each frame is found again where its tracks before and after it let expect its particles.
 
     Only the frames about the one that is made are held in memory.
 
@@ -247,28 +234,26 @@ def go_both_ways(
     ----------
     found : how particles belong together on the way forwards
     forward : gives the particles that were found in a frame then; those of a frame that no track comes near stay
-    store : takes those that are found now
     """
-    confirmed = long_ones(found, sequence.tracking.shortest or SHORTEST)
-    recent: dict[int, Seen] = {}
-    count = len(sequence.names)
-    for number in range(count):
-        recent.pop(number - REACH_FRAMES - 1, None)
-        if store.made(number) is not None:
-            continue
-        for near in range(max(number - REACH_FRAMES, 0), min(number + REACH_FRAMES + 1, count)):
-            if near not in recent:
-                recent[near] = seen_in(forward(near))
-        frame, ahead = sequence.frame(number), expected_in(confirmed, recent, number)
+
+    def __init__(self, sequence: Recorded, found: Trajectories, forward: Callable[[int], Points]) -> None:
+        """Take how particles belong together on the way forwards."""
+        self._sequence, self._forward = sequence, forward
+        self._confirmed = long_ones(found, sequence.tracking.shortest or SHORTEST)
+        self._recent: dict[int, Seen] = {}
+
+    def find(self, number: int, progress: Progress | None = None) -> Found:
+        """Find the particles of a frame again."""
+        sequence, bench, before = self._sequence, self._sequence.bench, self._recent
+        near = range(max(number - REACH_FRAMES, 0), min(number + REACH_FRAMES + 1, len(sequence.names)))
+        self._recent = {k: before[k] if k in before else seen_in(self._forward(k)) for k in near}
+        frame, ahead = sequence.frame(number), expected_in(self._confirmed, self._recent, number)
         if len(ahead.light):
-            particles, notices = _next(sequence, number, frame, ahead, progress)
-            _put(sequence, store, number, frame, particles, notices)
-        else:
-            points = forward(number)
-            task = task_for(sequence.bench, frame)
-            rows = _rows(sequence.bench, points.position_mm, points.arrays["intensity"])
-            residual = rebuilt(task, blank(task), rows).residual.reshape(frame.image.shape)
-            store.put(number, points, np.where(frame.unusable, 0.0, residual).astype(np.float32), [])
+            return _made(sequence, number, frame, *_next(sequence, number, frame, ahead, progress))
+        points, task = self._forward(number), task_for(bench, frame)
+        rows = _rows(bench, points.position_mm, points.arrays["intensity"])
+        residual = rebuilt(task, blank(task), rows).residual.reshape(frame.image.shape)
+        return points, np.where(frame.unusable, 0.0, residual).astype(np.float32), []
 
 
 def _next(
@@ -293,11 +278,8 @@ def _rows(bench: Bench, position_mm: Floats, light_counts: Floats) -> Floats:
     return np.column_stack([bench.content.camera.to_image_axes(from_focal_point), light_counts])
 
 
-def _put(
-    sequence: Recorded, store: Store, number: int, frame: Frame, found: Particles, notices: list[Notice]
-) -> Points:
-    """Return the particles found in a frame, after they were put into the store."""
+def _made(sequence: Recorded, number: int, frame: Frame, found: Particles, notices: list[Notice]) -> Found:
+    """Return what was found in a frame as it is kept."""
     points = points_of(sequence.bench, frame, found, sequence.size, sequence.provenance)
     notices = [*notices, *light_notices(points, sequence.names[number])]
-    store.put(number, points, np.asarray(what_is_left(frame, found), np.float32), notices)
-    return points
+    return points, np.asarray(what_is_left(frame, found), np.float32), notices
