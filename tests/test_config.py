@@ -5,19 +5,25 @@ from __future__ import annotations
 import json
 import re
 import time
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 
-from lfpiv_cli.errors import ConfigError, InputError
+from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.files.config import Config, load_config
 from lfpiv_cli.files.sections import Section
 from lfpiv_cli.files.sections_simulated import Sections
 from lfpiv_cli.flow.windows import ParallelWalls, RoundWall, layout_windows
+from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import fluid_path_to_focus
 from lfpiv_cli.reference import Reference
 from lfpiv_cli.verbs.reconstruct import ReconstructOptions
+from tests.commands import CONFIG, sample_rig
+from tests.hostile_files import ended
 
 CONFIGS = sorted((Path(__file__).parents[1] / "configs").glob("*.yaml"))
 
@@ -32,24 +38,20 @@ volume: {shape_xyz: [8, 6, 4], voxel_mm: 0.1}
 
 
 @pytest.fixture
-def write(tmp_path: Path):
+def write(tmp_path: Path) -> Callable[[str], Path]:
     """Write a config and return its path."""
 
-    def written(text: str | bytes) -> Path:
-        path = tmp_path / "rig.yaml"
-        path.write_bytes(text.encode() if isinstance(text, str) else text)
-        return path
+    def written(text: str) -> Path:
+        (tmp_path / "rig.yaml").write_text(text)
+        return tmp_path / "rig.yaml"
 
     return written
 
 
 def refusal(path: Path) -> str:
     """Return the message with which a config is refused."""
-    # Of this thread's work, whatever else the machine is busy with.
-    start = time.thread_time()
     with pytest.raises(ConfigError) as caught:
         load_config(path)
-    assert time.thread_time() - start < 1.0
     return str(caught.value)
 
 
@@ -60,8 +62,12 @@ def test_shipped_configs_load_and_return_from_json(path: Path) -> None:
     assert again.sections == config.sections
 
 
-def test_shipped_configs_are_there() -> None:
+def test_table2_is_shipped_and_gives_the_papers_camera(table2: Camera) -> None:
     assert {path.stem for path in CONFIGS} >= {"table2", "channel", "sample", "seaurchin", "guv"}
+    camera = load_config(CONFIGS[[path.stem for path in CONFIGS].index("table2")]).camera_model()
+    for name in ("image_distance_mm", "focus_distance_mm", "aperture_mm", "pixel_mm", "columns", "rows"):
+        assert getattr(camera, name) == pytest.approx(getattr(table2, name))
+    np.testing.assert_array_equal(camera.lattice.basis, table2.lattice.basis)
 
 
 def sections_in(model: type[Section]) -> set[type[Section]]:
@@ -81,13 +87,6 @@ def test_every_key_is_explained() -> None:
         for key in section.model_fields:
             places = explained + (section.__doc__ or "")
             assert re.search(rf"\b{key}\b", places) or section is Sections, f"{section.__name__}.{key}"
-
-
-def test_table2_gives_the_papers_camera(table2) -> None:
-    camera = load_config(CONFIGS[[path.stem for path in CONFIGS].index("table2")]).camera_model()
-    for name in ("image_distance_mm", "focus_distance_mm", "aperture_mm", "pixel_mm", "columns", "rows"):
-        assert getattr(camera, name) == pytest.approx(getattr(table2, name))
-    np.testing.assert_array_equal(camera.lattice.basis, table2.lattice.basis)
 
 
 @pytest.mark.parametrize(
@@ -139,62 +138,45 @@ def test_all_errors_come_in_one_run_in_the_order_of_the_file(write) -> None:
         ("channel: {width_mm: 9, wall_mm: 2, board_from_mid_plane_mm: 1}", "is for a board in the fluid"),
         ("correlation: {windows: []}", "at least one window"),
         ("correlation: {mask: pipe}", "correlation.mask: is pipe, which needs the section pipe"),
-        (
-            "pipe: {radius_mm: 5.0}\nchannel: {width_mm: 9, wall_mm: 2}",
-            "pipe.radius_mm: is 5, but channel.width_mm is 9",
-        ),
+        ("pipe: {radius_mm: 5.0}\nchannel: {width_mm: 9, wall_mm: 2}", "radius_mm: is 5, but channel.width_mm is 9"),
         ("correlation: {overlap: 1.0}", "less than 1"),
         ("simulation: {brightness: [2, 1]}", "expected a range"),
         ("simulation: {light_z_mm: [1, 1]}", "light_z_mm: is [1.0, 1.0], expected a range"),
         ("simulation: {brightness: [1, 2], brightness_log_sigma: 0.5}", "contradicts brightness"),
         ("validation: {flow_methods: [volumes, volumes]}", "expected each method once"),
         ("weights: {method: dlfc}\nvalidation: {flow_methods: [particles]}", "fitted with traced rays"),
-        (
-            "window: {distance_mm: 98.0, thickness_mm: 2.0}\nchannel: {width_mm: 10.0, wall_mm: 5.0}",
-            "but channel.wall_mm is 5",
-        ),
+        ("window: {distance_mm: 98, thickness_mm: 2}\nchannel: {width_mm: 9, wall_mm: 5}", "but channel.wall_mm is 5"),
     ],
 )
 def test_contradictions_are_named(write, addition: str, words: str) -> None:
     assert words in refusal(write(RIG + addition + "\n"))
 
 
-# What stands in the rig, what stands there instead, and words of what is said of it.
+# What stands in the rig, what stands there instead (`&` for the old), and words of what is said of it.
+APERTURE = "aperture_mm: 25.0"
 IMPOSSIBLE = [
-    ("aperture_mm: 25.0", "aperture_mm: 25.0, f_number: 5.6", "focal_length_mm / aperture_mm is 4"),
-    (
-        "aperture_mm: 25.0",
-        "aperture_mm: 25.0, image_distance_mm: 210",
-        "focal_length_mm (1 - magnification) is 200",
-    ),
-    (
-        "aperture_mm: 25.0",
-        "aperture_mm: 25.0, image_distance_mm: 200, pupil_ratio: 1.3",
-        "focal_length_mm (1.3 - magnification) is 230",
-    ),
-    (
-        "aperture_mm: 25.0",
-        "aperture_mm: 25.0, image_distance_mm: 200, image_distance: infinite",
-        "main_lens.image_distance_mm: is 200, but image_distance is infinite",
-    ),
-    (
-        "aperture_mm: 25.0",
-        "aperture_mm: 25.0, pupil_ratio: 2, image_distance: infinite",
-        "main_lens.pupil_ratio: is 2, but image_distance is infinite",
-    ),
+    (APERTURE, "&, f_number: 5.6", "focal_length_mm / aperture_mm is 4"),
+    (APERTURE, "&, image_distance_mm: 210", "focal_length_mm (1 - magnification) is 200"),
+    (APERTURE, "&, image_distance_mm: 200, pupil_ratio: 1.3", "focal_length_mm (1.3 - magnification) is 230"),
+    (APERTURE, "&, image_distance_mm: 200, image_distance: infinite", "is 200, but image_distance is infinite"),
+    (APERTURE, "&, pupil_ratio: 2, image_distance: infinite", "pupil_ratio: is 2, but image_distance is infinite"),
+    (APERTURE, "f_number: null", "needs aperture_mm or f_number"),
     ("focal_length_mm: 100.0, aperture_mm", "image_distance: infinite, aperture_mm", "needs focal_length_mm"),
-    ("aperture_mm: 25.0", "f_number: null", "needs aperture_mm or f_number"),
-    ("pitch_mm: 0.1", "pitch_mm: 0.1, f_number: 4.0", "focal_length_mm / pitch_mm is 8"),
+    ("pitch_mm: 0.1", "&, f_number: 4.0", "focal_length_mm / pitch_mm is 8"),
     ("shape_xyz: [8, 6, 4]", "size_mm: [1, 1, 1]", "contradicts size_mm"),
     ("shape_xyz: [8, 6, 4], ", "", "needs shape_xyz and voxel_mm, or size_mm"),
-    ("voxel_mm: 0.1", "voxel_mm: 0.1, reference: mid_plane", "needs the section channel"),
-    ("voxel_mm: 0.1", "voxel_mm: 0.1, centre_mm: [0, 0, -300]", "behind the lens, which is 200 mm away"),
+    ("voxel_mm: 0.1", "&, reference: mid_plane", "needs the section channel"),
+    ("voxel_mm: 0.1", "&, centre_mm: [0, 0, -300]", "behind the lens, which is 200 mm away"),
+    ("fluid: 1.33", "fluid: 0.9", "media.fluid: is 0.9, expected at least 1"),
 ]
 
 
 @pytest.mark.parametrize(("old", "new", "words"), IMPOSSIBLE)
-def test_impossible_physics_is_named_with_its_numbers(write, old: str, new: str, words: str) -> None:
-    assert words in refusal(write(RIG.replace(old, new)))
+def test_impossible_physics_is_named_with_its_numbers(tmp_path: Path, old: str, new: str, words: str) -> None:
+    rig = tmp_path / "rig.yaml"
+    rig.write_text(RIG.replace(old, new.replace("&", old)))
+    code, said = ended("build-weights", rig, "-o", tmp_path / "w.h5")
+    assert (code, words in said, (tmp_path / "w.h5").exists()) == (3, True, False), said
 
 
 def test_total_reflection_is_named_with_its_numbers(write) -> None:
@@ -210,6 +192,7 @@ def test_total_reflection_is_named_with_its_numbers(write) -> None:
 HOSTILE_TEXT = [
     (b"camera:\n\tmain_lens: 1\n", "2:1: is not YAML: a tab"),
     (b"a: &x [1]\nb: [*x, *x]\n", "alias"),
+    (b"a0: &a0 [x, x]\n" + b"".join(b"a%d: &a%d [*a%d, *a%d]\n" % (k, k, k - 1, k - 1) for k in range(1, 60)), "alias"),
     (b"a: !!python/object:os.system {}\n", "tag"),
     (b"a: " + b"[" * 5000 + b"]" * 5000, "deeper than 20"),
     (b"a: " + b"{a: " * 5000, "deeper than 20"),
@@ -225,33 +208,24 @@ HOSTILE_TEXT = [
 ]
 
 
-@pytest.mark.parametrize(("content", "words"), HOSTILE_TEXT)
-def test_hostile_text_is_refused_quickly(write, content: bytes, words: str) -> None:
-    message = refusal(write(content))
-    assert words in message
-    assert len(message) < 5000
+@pytest.mark.parametrize(("content", "words"), HOSTILE_TEXT, ids=[words for _, words in HOSTILE_TEXT])
+def test_hostile_text_is_refused_quickly(tmp_path: Path, content: bytes, words: str) -> None:
+    (tmp_path / "rig.yaml").write_bytes(content)
+    begun = time.thread_time()
+    code, said = ended("check", tmp_path / "rig.yaml")
+    assert (code, words in said, len(said) < 5000) == (3, True, True), said
+    assert time.thread_time() - begun < 1.0
 
 
-def test_alias_bomb_is_refused(write) -> None:
-    bomb = "a0: &a0 [x, x]\n" + "".join(f"a{k}: &a{k} [*a{k - 1}, *a{k - 1}]\n" for k in range(1, 60))
-    assert "alias" in refusal(write(bomb))
-
-
-@pytest.mark.parametrize("kind", ["missing", "folder", "empty"])
-def test_a_config_that_is_no_file_is_an_input_error(tmp_path: Path, kind: str) -> None:
-    path = tmp_path / "rig.yaml"
-    if kind == "folder":
-        path.mkdir()
-    if kind == "empty":
-        path.touch()
-    with pytest.raises(InputError, match="rig.yaml"):
-        load_config(path)
-
-
-def test_numbers_mean_what_yaml_1_2_says(write) -> None:
+def test_what_a_lattice_alone_and_numbers_of_yaml_1_2_mean(write) -> None:
     config = load_config(write(RIG.replace("0.8,", "8e-1,").replace("177", "0xB1")))
     assert config.camera_model().microlens_focal_length_mm == 0.8
     assert config.image_shape() == (177, 235)
+    # A lattice alone needs no main lens.
+    config = load_config(write("camera: {microlenses: {pitch_mm: 0.1}, sensor: {pixel_um: 5, columns: 9, rows: 7}}\n"))
+    assert config.image_shape() == (7, 9)
+    with pytest.raises(ConfigError, match="camera.main_lens: is missing"):
+        config.camera_model()
 
 
 @pytest.mark.parametrize(
@@ -272,22 +246,12 @@ def test_what_a_command_needs_and_the_file_lacks_is_named(write, section: str, a
         ask(config)
 
 
-def test_a_lattice_alone_needs_no_main_lens(write) -> None:
-    config = load_config(write("camera: {microlenses: {pitch_mm: 0.1}, sensor: {pixel_um: 5, columns: 9, rows: 7}}\n"))
-    assert config.image_shape() == (7, 9)
-    with pytest.raises(ConfigError, match="camera.main_lens: is missing"):
-        config.camera_model()
-
-
-def test_lengths_follow_from_f_numbers_and_the_image_distance(write) -> None:
+def test_lengths_follow_from_f_numbers_pupils_and_the_image_distance(write, table2: Camera) -> None:
     text = RIG.replace("focal_length_mm: 100.0, aperture_mm: 25.0", "image_distance_mm: 200, f_number: 4")
     camera = load_config(write(text.replace("{focal_length_mm: 0.8", "{f_number: 8"))).camera_model()
     assert (camera.focal_length_mm, camera.aperture_mm) == (100.0, 25.0)
     assert camera.microlens_distance_mm == camera.microlens_focal_length_mm == pytest.approx(0.8)
-
-
-def test_pupils_make_the_thin_lens_that_stands_for_the_real_one(write, table2) -> None:
-    """With P = 1.25 the array lies 100 (1.25 + 1) mm behind the exit pupil, the focus 180 mm before the entrance."""
+    # With P = 1.25 the array lies 100 (1.25 + 1) mm behind the exit pupil, the focus 180 mm before the entrance.
     for told in ("focal_length_mm: 100, pupil_ratio: 1.25", "image_distance_mm: 225, pupil_ratio: 1.25"):
         camera = load_config(write(RIG.replace("focal_length_mm: 100.0", told))).camera_model()
         assert camera.focus_distance_mm == pytest.approx(180.0)
@@ -299,16 +263,13 @@ def test_pupils_make_the_thin_lens_that_stands_for_the_real_one(write, table2) -
     assert camera.micro_image_lattice_px().pitch * 5.5 == pytest.approx(100.0)
 
 
-def test_grid_is_centred_and_moved(write) -> None:
+def test_grid_is_centred_and_moved_and_voxels_chosen_by_the_program_fill_the_size(write) -> None:
     grid = load_config(write(RIG.replace("voxel_mm: 0.1", "voxel_mm: [0.1, 0.2, 0.3], centre_mm: [1, 2, 3]"))).grid(
         Reference("mid_plane", -0.5)
     )
     assert grid.spacing_mm == (0.1, 0.2, 0.3)
     middle = [np.mean(grid.bounds_mm(axis)) for axis in range(3)]
     assert middle == pytest.approx([1.0, 2.0, 2.5])
-
-
-def test_voxels_chosen_by_the_program_fill_the_size(write) -> None:
     text = RIG.replace("shape_xyz: [8, 6, 4], voxel_mm: 0.1", "size_mm: [1.3, 1.0, 1.03]")
     grid = load_config(write(text)).grid()
     assert np.multiply(grid.shape_xyz, grid.spacing_mm) == pytest.approx([1.3, 1.0, 1.03])
@@ -316,16 +277,14 @@ def test_voxels_chosen_by_the_program_fill_the_size(write) -> None:
     assert 0.15 < grid.spacing_mm[2] < 0.25
 
 
-def test_windows_in_millimetres_are_the_final_ones(write) -> None:
+def test_windows_in_voxels_and_millimetres(write) -> None:
     config = load_config(write("correlation: {window_mm: 1.6}\n"))
     assert config.windows_voxel((0.1, 0.1, 0.2))[-1] == (16, 16, 8)
     assert load_config(write("correlation: {windows: [32, [16, 16, 8]]}\n")).windows_voxel((1, 1, 1)) == (
         (32, 32, 32),
         (16, 16, 8),
     )
-
-
-def test_windows_are_cubes_by_default_as_far_as_long_voxels_allow(write) -> None:
+    # Cubes by default, as far as long voxels allow.
     config = load_config(write("correlation: {dt_s: 0.001}\n"))
     assert config.windows_voxel((0.1, 0.1, 0.1)) == ((32, 32, 32), (16, 16, 16))
     assert config.windows_voxel((0.1, 0.1, 0.15)) == ((32, 32, 22), (16, 16, 11))
@@ -385,32 +344,71 @@ def test_flow_centres_move_with_the_origin(write) -> None:
     assert config.simulated_flow(Reference("mid_plane", 1.0))(points)[0] == pytest.approx([1.0, 0.0, 0.0])
 
 
-@pytest.mark.parametrize(
-    ("sections", "exponent"),
-    [
+def test_what_follows_from_other_sections_unless_given(write) -> None:
+    for sections, exponent in (
         ("reconstruction: {solver: em}", 0.5),
         ("reconstruction: {solver: sart}", 1.0),
         ("correlation: {exponent: 0.75}", 0.75),
-    ],
-)
-def test_the_exponent_follows_from_the_solver_unless_given(write, sections: str, exponent: float) -> None:
-    assert load_config(write(RIG + sections + "\n")).correlation_settings((1.0, 1.0, 1.0)).exponent == exponent
-
-
-@pytest.mark.parametrize(
-    ("sections", "methods"),
-    [
+    ):
+        assert load_config(write(RIG + sections)).correlation_settings((1.0, 1.0, 1.0)).exponent == exponent
+    for sections, methods in (
         ("", ("volumes", "particles")),
         ("weights: {method: dlfc}", ("volumes",)),
         ("reconstruction: {solver: particles}", ("particles",)),
         ("validation: {flow_methods: [particles]}", ("particles",)),
-    ],
-)
-def test_a_flow_is_measured_in_every_way_that_is_possible(write, sections: str, methods: tuple[str, ...]) -> None:
-    assert load_config(write(RIG + sections + "\n")).flow_methods() == methods
-
-
-def test_volumes_are_none_that_a_solver_of_particles_makes(write) -> None:
+    ):
+        assert load_config(write(RIG + sections)).flow_methods() == methods
     text = "reconstruction: {solver: particles}\nvalidation: {flow_methods: [volumes, particles]}\n"
     with pytest.raises(ConfigError, match="flow_methods: holds volumes"):
         load_config(write(RIG + text)).flow_methods()
+
+
+def changed(folder: Path, keys: str, value: Any, **others: Any) -> Path:
+    """Write the sample's config with another value of a key, and other sections' keys."""
+    config = yaml.safe_load(CONFIG.read_text())
+    config["volume"] |= {"shape_xyz": [3, 2, 2], "reference": "focal_point"}
+    for name, new in {keys: value, **others}.items():
+        *sections, key = name.split(".")
+        section = config
+        for each in sections:
+            section = section.setdefault(each, {})
+        section[key] = new
+    (folder / "rig.yaml").write_text(yaml.safe_dump(config))
+    return folder / "rig.yaml"
+
+
+LENS = "camera.main_lens."
+
+
+@pytest.mark.parametrize("value", [1e300, 1e-300])
+@pytest.mark.parametrize(
+    "keys",
+    [f"{LENS}aperture_mm", f"{LENS}magnification", f"{LENS}focal_length_mm", "camera.microlenses.focal_length_mm"]
+    + ["camera.sensor.microlens_distance_mm", "volume.voxel_mm", "correlation.dt_s", "simulation.distortion_per_mm2"],
+)
+def test_numbers_that_no_bench_has_are_named(tmp_path: Path, keys: str, value: float) -> None:
+    code, said = ended("check", changed(tmp_path, keys, -value if keys.endswith("magnification") else value))
+    assert (code, keys in said) == (3, True), said
+
+
+@pytest.mark.parametrize("number", ["0x" + "f" * 20_000, "0o" + "7" * 20_000, "9" * 4_000, "-" + "9" * 20_000])
+def test_integers_of_any_length_are_named(tmp_path: Path, number: str) -> None:
+    code, said = ended("build-weights", sample_rig(tmp_path, ("seed: 3", f"seed: {number}")), "-o", tmp_path / "w.h5")
+    assert (code, "simulation.seed: is too long a number" in said) == (3, True), said
+
+
+def test_light_that_only_the_volumes_corners_lose_is_named(tmp_path: Path) -> None:
+    lens = {"magnification": -8.0, "focal_length_mm": 100.0, "aperture_mm": 112.5}
+    others = {"camera.main_lens": lens, "volume.voxel_mm": [4.0, 4.0, 0.01]}
+    rig = changed(tmp_path, "media", {"air": 2.2, "window": 1.0, "fluid": 1.0}, **others)
+    code, said = ended("simulate", "particles", rig, "-o", tmp_path / "simulated")
+    assert (code, "totally reflected" in said) == (3, True), said
+
+
+@pytest.mark.parametrize(
+    ("keys", "value"), [("camera.microlenses.focal_length_mm", 1e-9), ("camera.main_lens.aperture_mm", 25_000.0)]
+)
+def test_lens_images_that_cannot_be_are_named(tmp_path: Path, keys: str, value: float) -> None:
+    rig = changed(tmp_path, keys, value)
+    assert ended("build-weights", rig, "--dry-run", "-o", tmp_path / "w.h5")[0] == 3
+    assert ended("check", rig)[0] == 3
