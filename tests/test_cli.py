@@ -7,13 +7,10 @@ import signal
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parent.parent
-SAMPLE = ROOT / "sample_data"
-CONFIG = ROOT / "configs" / "sample.yaml"
+from tests.commands import AT_FOCUS, CONFIG, SAMPLE, sample_rig
 
 
 def lfpiv(*arguments: object, **options: object) -> subprocess.CompletedProcess[str]:
@@ -21,71 +18,46 @@ def lfpiv(*arguments: object, **options: object) -> subprocess.CompletedProcess[
     return subprocess.run(command, capture_output=True, text=True, timeout=120, **options)
 
 
-def test_help_imports_nothing_heavy():
-    script = "import sys, lfpiv_cli.cli; print(sorted({'numpy', 'numba', 'h5py', 'scipy'} & set(sys.modules)))"
+@pytest.mark.parametrize("module", ["lfpiv_cli", "lfpiv_cli.cli"])
+def test_nothing_heavy_is_imported_for_help_or_by_a_script(module):
+    script = f"import sys, {module}; print(sorted({{'numpy', 'numba', 'h5py', 'scipy'}} & set(sys.modules)))"
     assert subprocess.run([sys.executable, "-c", script], capture_output=True, text=True).stdout.strip() == "[]"
 
 
 @pytest.mark.thorough
-def test_usage_errors_give_2(tmp_path):
-    assert lfpiv("no-such-command").returncode == 2
-    assert lfpiv("simulate", "white", CONFIG).returncode == 2
-    # an output that is an input
-    assert lfpiv("build-weights", CONFIG, "-o", CONFIG, "--overwrite").returncode == 2
-
-
-@pytest.mark.thorough
-def test_config_errors_give_3_with_line_and_near_miss(tmp_path):
-    broken = tmp_path / "rig.yaml"
+def test_exit_codes_and_what_is_said(tmp_path):
+    broken, target, file = tmp_path / "rig.yaml", tmp_path / "w.h5", tmp_path / "file"
     broken.write_text(CONFIG.read_text().replace("layout:", "layuot:"))
-    done = lfpiv("build-weights", broken, "-o", tmp_path / "w.h5")
-    assert done.returncode == 3
-    assert f"{broken}:6:" in done.stderr
-    assert "did you mean 'layout'?" in done.stderr
-    assert "Traceback" not in done.stderr
-    assert not (tmp_path / "w.h5").exists()
-
-
-@pytest.mark.thorough
-def test_missing_input_gives_4_and_names_it(tmp_path):
-    done = lfpiv("calibrate-snapshot", CONFIG, "--white", tmp_path / "no such.tif", "-o", tmp_path / "c.h5")
-    assert done.returncode == 4
-    assert "no such.tif" in done.stderr
-    assert done.stderr.count("\n") == 1
-
-
-@pytest.mark.thorough
-def test_existing_output_gives_6_and_is_untouched(tmp_path):
-    target = tmp_path / "w.h5"
-    target.write_text("mine")
-    assert lfpiv("build-weights", CONFIG, "-o", target).returncode == 6
-    assert target.read_text() == "mine"
-
-
-@pytest.mark.thorough
-def test_unwritable_output_gives_7_before_computing(tmp_path):
-    (tmp_path / "file").write_text("no folder", encoding="utf-8")
-    assert lfpiv("build-weights", CONFIG, "-o", tmp_path / "file" / "such" / "w.h5").returncode == 7
+    file.write_text("mine", encoding="utf-8")
+    for code, said, words in (
+        (2, "", ("no-such-command",)),
+        (2, "", ("simulate", "white", CONFIG)),
+        (2, "", ("build-weights", CONFIG, "-o", CONFIG, "--overwrite")),
+        (3, f"{broken}:6:", ("build-weights", broken, "-o", target)),
+        (3, "did you mean 'layout'?", ("build-weights", broken, "-o", target)),
+        (4, "no such.tif", ("calibrate-snapshot", CONFIG, "--white", tmp_path / "no such.tif", "-o", target)),
+        (6, "file", ("build-weights", CONFIG, "-o", file)),
+        # Before anything is computed.
+        (7, "file", ("build-weights", CONFIG, "-o", file / "such" / "w.h5")),
+    ):
+        done = lfpiv(*words)
+        assert (done.returncode, said in done.stderr, "Traceback" in done.stderr) == (code, True, False), words
+        assert code == 2 or done.stderr.count("\n") == 1
+    assert file.read_text() == "mine"
+    assert not target.exists()
 
 
 @pytest.mark.thorough
 def test_json_goes_to_stdout_alone(tmp_path):
-    config = tmp_path / "air.yaml"
-    config.write_text(CONFIG.read_text().replace("reference: mid_plane", "reference: focal_point"))
-    done = lfpiv("build-weights", config, "-o", tmp_path / "w.h5", "--json")
-    assert done.returncode == 0
-    assert done.stdout.startswith("{")
-    assert done.stdout.count("\n") == 1
-    assert done.stderr == ""
+    done = lfpiv("build-weights", sample_rig(tmp_path, AT_FOCUS), "-o", tmp_path / "w.h5", "--json")
+    assert (done.returncode, done.stdout[0], done.stdout.count("\n"), done.stderr) == (0, "{", 1, "")
 
 
 def test_a_closed_pipe_is_quiet():
     done = subprocess.run(
         f"'{sys.executable}' -m lfpiv_cli --help | head -1", shell=True, capture_output=True, text=True, timeout=60
     )
-    assert done.returncode == 0
-    assert done.stdout.startswith("Usage")
-    assert done.stderr == ""
+    assert (done.returncode, done.stdout[:5], done.stderr) == (0, "Usage", "")
 
 
 def hear_interrupts():
@@ -122,14 +94,8 @@ except BaseException as error:
     ],
 )
 def test_a_signal_during_a_call_back_is_not_lost(sent, name, said):
-    done = subprocess.run(
-        [sys.executable, "-c", IGNORED_FIRST, sent],
-        capture_output=True,
-        text=True,
-        check=True,
-        timeout=60,
-        preexec_fn=hear_interrupts,
-    )
+    words, heard = [sys.executable, "-c", IGNORED_FIRST, sent], {"capture_output": True, "text": True}
+    done = subprocess.run(words, check=True, timeout=60, preexec_fn=hear_interrupts, **heard)
     assert done.stdout.split() == ["ignored", name]
     assert done.stderr == f"lfpiv: {said}\n"
 
@@ -161,12 +127,8 @@ def test_a_signal_is_answered_while_a_compiled_call_goes_on():
 def test_what_nohup_has_ignored_stays_so():
     script = "import signal; from lfpiv_cli.cli.main import end_by_signals; end_by_signals(); "
     script += "signal.raise_signal(signal.SIGHUP); print('here')"
-    done = subprocess.run(
-        [sys.executable, "-c", script],
-        capture_output=True,
-        text=True,
-        preexec_fn=lambda: signal.signal(signal.SIGHUP, signal.SIG_IGN),
-    )
+    ignored = {"preexec_fn": lambda: signal.signal(signal.SIGHUP, signal.SIG_IGN)}
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, **ignored)
     assert (done.stdout, done.stderr) == ("here\n", "")
 
 
@@ -177,9 +139,7 @@ def test_what_nohup_has_ignored_stays_so():
     [("SIGTERM", 143, "terminated"), ("SIGINT", 130, "interrupted"), ("SIGHUP", 129, "hung up")],
 )
 def test_signals_end_the_work_and_leave_nothing(tmp_path, sent, code, said):
-    config = tmp_path / "air.yaml"
-    config.write_text(CONFIG.read_text().replace("reference: mid_plane", "reference: focal_point"))
-    assert lfpiv("build-weights", config, "-o", tmp_path / "w.h5").returncode == 0
+    assert lfpiv("build-weights", sample_rig(tmp_path, AT_FOCUS), "-o", tmp_path / "w.h5").returncode == 0
     # Compilation, which answers late, is over then.
     assert lfpiv("reconstruct", tmp_path / "w.h5", SAMPLE / "pair_a.tif", "-o", tmp_path / "v.vtkhdf").returncode == 0
     (tmp_path / "v.vtkhdf").unlink()
@@ -200,7 +160,7 @@ def test_signals_end_the_work_and_leave_nothing(tmp_path, sent, code, said):
     assert process.returncode == code
     assert f"lfpiv: {said}\n" in words
     assert "Traceback" not in words
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["air.yaml", "w.h5"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["rig.yaml", "w.h5"]
 
 
 A_BROKEN_LIBRARY = """

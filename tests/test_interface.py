@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import inspect
 import pydoc
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,18 +11,11 @@ import numpy as np
 import pytest
 
 import lfpiv_cli as lf
-from lfpiv_cli.cli.main import cli
 from lfpiv_cli.errors import ConfigError, InputError, UsageError
 from lfpiv_cli.files.images import write_tiff
+from tests.commands import CONFIG, SAMPLE, run
 
-ROOT = Path(__file__).parent.parent
-SAMPLE = ROOT / "sample_data"
-CONFIG = ROOT / "configs" / "sample.yaml"
 FEW = {"solver": "sart", "iterations": 2}
-
-
-def run(*arguments: object) -> None:
-    cli.main([*(str(argument) for argument in arguments), "-q"], standalone_mode=False)
 
 
 def image(name: str) -> np.ndarray:
@@ -44,17 +35,17 @@ def by_commands(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("commands")
     white, dark, board, *pair = (SAMPLE / f"{name}.tif" for name in ("white", "dark", "board", "pair_a", "pair_b"))
     pictures = ("--white", white, "--dark", dark, "--board", board)
-    run("calibrate-snapshot", CONFIG, *pictures, "-o", out / "calibration.h5")
-    run("build-weights", CONFIG, "--calibration", out / "calibration.h5", "-o", out / "weights.h5")
+    run("calibrate-snapshot", CONFIG, *pictures, "-o", out / "calibration.h5", "-q")
+    run("build-weights", CONFIG, "--calibration", out / "calibration.h5", "-o", out / "weights.h5", "-q")
     few = ("--solver", "sart", "--iterations", 2)
-    run("reconstruct", out / "weights.h5", *pair, "--dark", dark, *few, "-o", out / "volumes")
+    run("reconstruct", out / "weights.h5", *pair, "--dark", dark, *few, "-o", out / "volumes", "-q")
     volumes = [out / "volumes" / f"{path.stem}.vtkhdf" for path in pair]
-    run("correlate", *volumes, "-o", out / "vectors.vtkhdf")
+    run("correlate", *volumes, "-o", out / "vectors.vtkhdf", "-q")
     write_tiff(out / "mask.tif", corner(), overwrite=False)
     searched = ("--dark", dark, "--mask", out / "mask.tif", "--solver", "particles")
-    run("reconstruct", out / "weights.h5", *pair, *searched, "-o", out / "particles")
+    run("reconstruct", out / "weights.h5", *pair, *searched, "-o", out / "particles", "-q")
     particles = [out / "particles" / f"{path.stem}.vtkhdf" for path in pair]
-    run("track", *particles, "--grid", "-o", out / "tracks.vtkhdf")
+    run("track", *particles, "--grid", "-o", out / "tracks.vtkhdf", "-q")
     return out
 
 
@@ -149,8 +140,3 @@ def test_help_names_all_that_is_promised() -> None:
     words = pydoc.plain(pydoc.render_doc(lf))
     for name in set(lf.__all__) - {"__version__", "LfpivError", "LfpivWarning"}:
         assert name in words
-
-
-def test_importing_is_quick() -> None:
-    script = "import sys, lfpiv_cli; print(sorted({'numpy', 'numba', 'h5py', 'scipy'} & set(sys.modules)))"
-    assert subprocess.run([sys.executable, "-c", script], capture_output=True, text=True).stdout.strip() == "[]"
