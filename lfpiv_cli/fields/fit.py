@@ -9,13 +9,13 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.optimize import minimize
 from scipy.spatial import KDTree
 from scipy.special import gammaincinv
 from threadpoolctl import threadpool_limits
 
-from lfpiv_cli.arrays import Floats
+from lfpiv_cli.arrays import Flags, Floats, Integers
 from lfpiv_cli.fields.spline_field import SplineField, lattice_for, spline_field
 from lfpiv_cli.fields.structure import (
     INDEPENDENT,
@@ -153,7 +153,7 @@ class KrigedField:
     samples: Samples
     structure: VectorStructure
     off_by: Floats
-    kept: NDArray[np.bool_]
+    kept: Flags
 
     @property
     def probability(self) -> Floats:
@@ -238,9 +238,7 @@ def kriged_field(samples: Samples, divergence: str) -> KrigedField:
     return KrigedField(samples.subset(kept), structure, off_by, kept)
 
 
-def _told(
-    samples: Samples, shares: Sequence[float], size: tuple[int, int]
-) -> tuple[VectorStructure, NDArray[np.bool_], Floats]:
+def _told(samples: Samples, shares: Sequence[float], size: tuple[int, int]) -> tuple[VectorStructure, Flags, Floats]:
     """Return the structure function that samples tell, which (n,) are no outliers, and how far off these are.
 
     Outliers make a first structure function too rough: by it the far ones go. Shares and size are those of
@@ -252,9 +250,7 @@ def _told(
     return structure, *_without_outliers(samples, structure, kept, OUTLIER_ROUNDS)
 
 
-def _without_outliers(
-    samples: Samples, structure: VectorStructure, kept: NDArray[np.bool_], rounds: int
-) -> tuple[NDArray[np.bool_], Floats]:
+def _without_outliers(samples: Samples, structure: VectorStructure, kept: Flags, rounds: int) -> tuple[Flags, Floats]:
     """Return which samples (n,) belong to the flow, and how far off (kept, 3) these are in standard deviations.
 
     Of each it is the `kept` ones, and in later rounds those of the round before, that let expect something.
@@ -285,7 +281,7 @@ def _without_outliers(
     return kept, np.abs(off[kept]) / np.sqrt(np.einsum("nii->ni", covariance[kept]))
 
 
-def _nearest(points: Floats, places: Floats, count: int) -> list[tuple[slice, NDArray[np.int64]]]:
+def _nearest(points: Floats, places: Floats, count: int) -> list[tuple[slice, Integers]]:
     """Return slices of the places, and the numbers (b, k) of the points nearest to each of them."""
     near = KDTree(points).query(places, k=np.arange(1, min(count, len(points)) + 1))[1]
     parts = [slice(start, start + PLACES_AT_ONCE) for start in range(0, len(places), PLACES_AT_ONCE)]

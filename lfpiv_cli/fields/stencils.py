@@ -14,12 +14,12 @@ from math import factorial
 
 import numba
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.interpolate import BSpline
 from scipy.linalg import cholesky, solve_triangular
 from scipy.linalg.lapack import dpotri
 
-from lfpiv_cli.arrays import Floats
+from lfpiv_cli.arrays import Flags, Floats, Integers
 from lfpiv_cli.threads import share_out
 
 # Cubic B-splines on a box: a lattice of knots, the four splines along each axis that reach a point, their integrals.
@@ -100,7 +100,7 @@ class Lattice:
         """The box' smallest length."""
         return float(np.min(np.multiply(self.cells, self.cell_mm)))
 
-    def splines_at(self, points_mm: Floats, along: int | None = None) -> tuple[NDArray[np.int64], list[Floats]]:
+    def splines_at(self, points_mm: Floats, along: int | None = None) -> tuple[Integers, list[Floats]]:
         """Return the first spline (n, 3) that reaches each point, and the values (n, 4) of the four, axis by axis.
 
         A point outside of the box is taken by its nearest cell's polynomials. `along` an axis: the derivative, per mm.
@@ -227,7 +227,7 @@ def right_hand_side(lattice: Lattice, points_mm: Floats, weighted: Floats) -> Fl
     return np.ascontiguousarray(found.transpose(1, 0, 2, 3))
 
 
-def rows_of(lattice: Lattice, points_mm: Floats, along: int | None = None) -> tuple[NDArray[np.int64], Floats]:
+def rows_of(lattice: Lattice, points_mm: Floats, along: int | None = None) -> tuple[Integers, Floats]:
     """Return numbers and values (n, 64) of the splines that reach each point, in C order of (nx, ny, nz)."""
     first, (x, y, z) = lattice.splines_at(points_mm, along)
     _, ny, nz = lattice.shape
@@ -240,14 +240,14 @@ def rows_of(lattice: Lattice, points_mm: Floats, along: int | None = None) -> tu
     return columns.reshape(len(first), -1), values.reshape(len(first), -1)
 
 
-def gradient_rows(lattice: Lattice, points_mm: Floats) -> tuple[NDArray[np.int64], Floats]:
+def gradient_rows(lattice: Lattice, points_mm: Floats) -> tuple[Integers, Floats]:
     """Return numbers (n, 64) and gradients (n, 3, 64) of the splines that reach each point."""
     parts = [rows_of(lattice, points_mm, axis) for axis in range(3)]
     return parts[0][0], np.stack([values for _, values in parts], axis=1)
 
 
 @lru_cache(maxsize=4)
-def _pattern(components: int, ny: int, nz: int) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]:
+def _pattern(components: int, ny: int, nz: int) -> tuple[Integers, Integers, Flags]:
     """Return the rows and columns of a plane's block that have entries, and which of the stencil's these are."""
     one, y, z, other, j, k = np.indices((components, ny, nz, components, NEIGHBOURS, NEIGHBOURS))
     to_y, to_z = y + j - DEGREE, z + k - DEGREE

@@ -20,10 +20,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg.lapack import dposv
 
-from lfpiv_cli.arrays import Floats
+from lfpiv_cli.arrays import Flags, Floats, Integers
 
 # Of the middle of two places with independent errors, whose difference is the displacement.
 OF_MIDDLES = 0.25
@@ -52,7 +51,7 @@ class Samples:
     def __len__(self) -> int:
         return len(self.points_mm)
 
-    def subset(self, which: NDArray[np.bool_] | NDArray[np.int64]) -> Samples:
+    def subset(self, which: Flags | Integers) -> Samples:
         """Return some of them."""
         return replace(
             self,
@@ -302,7 +301,7 @@ def log_likelihood(matrices: Floats, values: Floats) -> float:
 
 
 def estimated(
-    at: Floats, near: NDArray[np.int64], samples: Samples, structure: VectorStructure, unknown: float
+    at: Floats, near: Integers, samples: Samples, structure: VectorStructure, unknown: float
 ) -> tuple[Floats, Floats]:
     """Return the estimates (b, 3) at places (b, 3) from the samples `near` (b, k), and their errors' covariances (b, 3,
     3).
@@ -322,7 +321,7 @@ def estimated(
 
 
 def estimated_slopes(
-    at: Floats, near: NDArray[np.int64], samples: Samples, structure: VectorStructure, unknown: float
+    at: Floats, near: Integers, samples: Samples, structure: VectorStructure, unknown: float
 ) -> Floats:
     """Return the gradients (b, 3, 3) per mm [component, direction] of the estimates, neighbourhoods held fixed."""
     points, values = samples.points_mm[near], samples.value_mm[near]

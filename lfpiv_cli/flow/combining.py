@@ -18,10 +18,9 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from lfpiv_cli.arrays import Floats
+from lfpiv_cli.arrays import Flags, Floats, Integers
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.flow.correlation import SMALLEST_VALID_FRACTION
 from lfpiv_cli.flow.field import MASKED, REJECTED, REPLACED, SECOND_PEAK, VALID, VectorField
@@ -64,7 +63,7 @@ class Combined:
     field: VectorField
     first_share: Floats
     disagreement: Floats
-    left_out: NDArray[np.bool_]
+    left_out: Flags
     widened: Floats
 
 
@@ -129,7 +128,7 @@ def combine(first: VectorField, second: VectorField) -> Combined:
     return Combined(field, share, disagreement, left_out, widened)
 
 
-def _estimate_unstated(values: Floats, stated: Floats, ranks: NDArray[np.int64]) -> None:
+def _estimate_unstated(values: Floats, stated: Floats, ranks: Integers) -> None:
     """Give measured vectors without an uncertainty the one that their distances from the other field's show.
 
     It is no smaller than that of a typical vector of their field that states one.
@@ -149,7 +148,7 @@ def _spread(difference: Floats) -> Floats:
     return np.asarray(np.quantile(np.abs(difference), SPREAD_SHARE, axis=0) / SPREAD_SIGMAS)
 
 
-def _widening(difference: Floats, stated: Floats, both: NDArray[np.bool_]) -> Floats:
+def _widening(difference: Floats, stated: Floats, both: Flags) -> Floats:
     """Return the factors (2, 3), one or more, with which the uncertainties of two fields explain their differences.
 
     What is missing in the variance is shared as the squares of the stated variances: alike between equals, and almost
@@ -164,7 +163,7 @@ def _widening(difference: Floats, stated: Floats, both: NDArray[np.bool_]) -> Fl
     return np.asarray(np.sqrt(1.0 + np.maximum(spread**2 - 1.0, 0.0) * share / np.sum(share**2, axis=0)))
 
 
-def _mean(values: Floats, sigma: Floats, used: NDArray[np.bool_]) -> tuple[Floats, Floats]:
+def _mean(values: Floats, sigma: Floats, used: Flags) -> tuple[Floats, Floats]:
     """Return the mean of two fields' values, weighted where both are used, and the first one's weight; NaN for none."""
     both = np.all(used, axis=0, keepdims=True)[0][..., np.newaxis]
     variance = np.where(both, sigma**2, 1.0)
@@ -174,9 +173,7 @@ def _mean(values: Floats, sigma: Floats, used: NDArray[np.bool_]) -> tuple[Float
     return np.where(some, parts.sum(axis=0), np.nan), np.where(some, share, np.nan)
 
 
-def _second_fits_better(
-    values: Floats, sigma: Floats, used: NDArray[np.bool_], disagree: NDArray[np.bool_], masked: NDArray[np.bool_]
-) -> NDArray[np.bool_]:
+def _second_fits_better(values: Floats, sigma: Floats, used: Flags, disagree: Flags, masked: Flags) -> Flags:
     """Return where, of two that disagree, the second is nearer to what the vectors around both let expect.
 
     Around them count the vectors that are not in doubt themselves; where too few are at hand, the smaller stated
@@ -193,7 +190,7 @@ def _second_fits_better(
     return second
 
 
-def _of_one(first: Floats, second: Floats, used: NDArray[np.bool_]) -> Floats:
+def _of_one(first: Floats, second: Floats, used: Flags) -> Floats:
     """Return the first field's values where it is used and knows them, else the second's; NaN where neither does."""
     return np.asarray(np.where(used[0] & np.isfinite(first), first, np.where(used[1], second, np.nan)))
 
@@ -280,7 +277,7 @@ def vectors_from_paths(paths: Paths, windows: WindowGrid, dt_s: float | None) ->
     )
 
 
-def without_tracks(middle_mm: Floats, nodes_mm: Floats, windows: WindowGrid) -> NDArray[np.bool_]:
+def without_tracks(middle_mm: Floats, nodes_mm: Floats, windows: WindowGrid) -> Flags:
     """Return which nodes (m,) lie in a region without tracks, where tracks elsewhere are as dense as they are.
 
     A fit to the nearest tracks would only extend what the flow does beside the region. Nearness is counted in boxes of

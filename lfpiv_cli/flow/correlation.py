@@ -20,7 +20,7 @@ from numba import njit
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from lfpiv_cli.arrays import Floats
+from lfpiv_cli.arrays import Flags, Floats, Singles
 from lfpiv_cli.errors import ConfigError, InputError
 from lfpiv_cli.flow.deformation import Spline, deform_pair, matrices_to_voxels, spline_coefficients, spline_matrix
 from lfpiv_cli.flow.field import VectorField
@@ -62,7 +62,7 @@ class Coarse:
         binned_size = triple(max(2, round(w / width)) for w, width in zip(size, bins, strict=True))
         return cls(settings.layout(cells, binned_size), bins, cells[::-1])
 
-    def sums(self, volumes: Iterable[NDArray[np.float32]]) -> MapSums:
+    def sums(self, volumes: Iterable[Singles]) -> MapSums:
         """Return what the correlation of two volumes is made of after binning."""
         before, after = margins(self.layout, self.cells_zyx, COARSE_RADIUS)
         inside = tuple(slice(m, m + n) for m, n in zip(before, self.cells_zyx, strict=True))
@@ -94,7 +94,7 @@ class Coarse:
 
 
 @njit(cache=True, nogil=True)
-def sum_bins(part: tuple[int, int], volume: NDArray[np.float32], bins: Triple, sums: NDArray[np.float32]) -> None:
+def sum_bins(part: tuple[int, int], volume: Singles, bins: Triple, sums: Singles) -> None:
     """Write sums over bins of `bins` voxels along (z, y, x), planes `part` of them."""
     for cell_z in range(part[0], part[1]):
         line = np.empty(volume.shape[2])
@@ -137,7 +137,7 @@ class Pass:
 
 
 # Two volumes ready for deformation: their splines, and where both may be used (size 0 for everywhere).
-Pair = tuple[Spline, Spline, NDArray[np.bool_]]
+Pair = tuple[Spline, Spline, Flags]
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,11 +154,11 @@ class Measured:
 
 
 def correlate(
-    pairs: Iterable[tuple[NDArray[np.float32], NDArray[np.float32]]],
+    pairs: Iterable[tuple[Singles, Singles]],
     grid: Grid,
     settings: CorrelationSettings,
     *,
-    mask: NDArray[np.bool_] | None = None,
+    mask: Flags | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> VectorField:
     """Return the displacements from the first to the second volume of a pair, or those that several have in common.
@@ -245,9 +245,7 @@ def _ensure_possible(settings: CorrelationSettings) -> None:
         raise ConfigError(f"the exponent of the correlated intensities is {exponent}; it must be above 0 and at most 1")
 
 
-def _usable_voxels(
-    a: NDArray[np.float32], b: NDArray[np.float32], mask: NDArray[np.bool_] | None, grid: Grid
-) -> tuple[NDArray[np.bool_], NDArray[np.float32], NDArray[np.float32]]:
+def _usable_voxels(a: Singles, b: Singles, mask: Flags | None, grid: Grid) -> tuple[Flags, Singles, Singles]:
     """Return where both volumes may be used (size 0 for everywhere), and both with zeros elsewhere."""
     for name, array in (("first volume", a), ("second volume", b), ("mask", mask)):
         if array is not None and array.shape != grid.shape_zyx:

@@ -17,7 +17,7 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
-from lfpiv_cli.arrays import Floats
+from lfpiv_cli.arrays import Flags, Floats, Singles
 from lfpiv_cli.flow.windows import Triple, WindowLayout
 from lfpiv_cli.threads import COUNT_NO_REFERENCES, share_out
 
@@ -45,11 +45,11 @@ class Spline:
     shape_zyx : voxels of the volume
     """
 
-    flat: NDArray[np.float32]
+    flat: Singles
     shape_zyx: Triple
 
 
-def spline_coefficients(volume: NDArray[np.float32]) -> Spline:
+def spline_coefficients(volume: Singles) -> Spline:
     """Return the cubic B-spline through a volume's voxels, scaled to a largest magnitude of 1.
 
     The correlation is normalised anyway, and products stay far from the limits of float32. Beyond the faces the volume
@@ -73,7 +73,7 @@ def spline_coefficients(volume: NDArray[np.float32]) -> Spline:
 
 
 @njit(cache=True)
-def pivots(count: int) -> NDArray[np.float32]:
+def pivots(count: int) -> Singles:
     """Return the factors of the elimination of c[i - 1] + 4 c[i] + c[i + 1] = 6 s[i] with both ends given."""
     factors = np.zeros(count, dtype=np.float32)
     for i in range(1, count - 1):
@@ -82,7 +82,7 @@ def pivots(count: int) -> NDArray[np.float32]:
 
 
 @njit(cache=True)
-def filter_lines(lines: NDArray[np.float32], factors: NDArray[np.float32]) -> None:
+def filter_lines(lines: Singles, factors: Singles) -> None:
     """Replace samples by B-spline coefficients along the first axis of (n, lines), in place.
 
     With odd reflection the outermost coefficients are the outermost samples; between them a tridiagonal system remains.
@@ -100,9 +100,7 @@ def filter_lines(lines: NDArray[np.float32], factors: NDArray[np.float32]) -> No
 
 
 @njit(cache=True, nogil=True)
-def filter_planes(
-    part: tuple[int, int], volume: NDArray[np.float32], scale: np.float32, coefficients: NDArray[np.float32]
-) -> None:
+def filter_planes(part: tuple[int, int], volume: Singles, scale: np.float32, coefficients: Singles) -> None:
     """Write the B-spline coefficients along x and y of a volume times `scale`, planes `part` of them."""
     along_y, along_x = pivots(volume.shape[1]), pivots(volume.shape[2])
     for z in range(part[0], part[1]):
@@ -117,7 +115,7 @@ def filter_planes(
 
 
 @njit(cache=True, nogil=True)
-def filter_depth(part: tuple[int, int], volume: NDArray[np.float32]) -> None:
+def filter_depth(part: tuple[int, int], volume: Singles) -> None:
     """Replace samples by B-spline coefficients along z, rows `part` of each plane, in place."""
     factors = pivots(volume.shape[0])
     for y in range(part[0], part[1]):
@@ -139,9 +137,7 @@ def spline_matrix(nodes: Floats, positions: Floats) -> Floats:
 
 
 @lru_cache(maxsize=4)
-def matrices_to_voxels(
-    layout: WindowLayout, shape_xyz: Triple
-) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+def matrices_to_voxels(layout: WindowLayout, shape_xyz: Triple) -> tuple[Singles, Singles, Singles]:
     """Return the spline matrices (voxels, windows) along x, y, z from window centres to all voxels.
 
     Most passes have the same ones.
@@ -156,12 +152,12 @@ def matrices_to_voxels(
 def deform_pair(
     a: Spline,
     b: Spline,
-    mask: NDArray[np.bool_],
+    mask: Flags,
     predictor: Floats,
-    to_voxels: tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]],
+    to_voxels: tuple[Singles, Singles, Singles],
     before: Triple,
     after: Triple,
-) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint8]]:
+) -> tuple[Singles, Singles, NDArray[np.uint8]]:
     """Return both volumes deformed half-way towards each other, and where they are valid, with a margin of zeros.
 
     Parameters
@@ -186,12 +182,12 @@ def deform_pair(
 @njit(cache=True, nogil=True)
 def deform_planes(
     part: tuple[int, int],
-    flat: tuple[NDArray[np.float32], NDArray[np.float32]],
-    mask: NDArray[np.bool_],
-    half: NDArray[np.float32],
-    to_voxels: tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]],
+    flat: tuple[Singles, Singles],
+    mask: Flags,
+    half: Singles,
+    to_voxels: tuple[Singles, Singles, Singles],
     before: Triple,
-    out: tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint8]],
+    out: tuple[Singles, Singles, NDArray[np.uint8]],
 ) -> None:
     """Deform planes `part` by half displacements (nz, 3, ny, nx) that the matrices carry to the voxels.
 
@@ -236,9 +232,7 @@ def deform_planes(
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
-def gather_taps(
-    moved: NDArray[np.float32], x: int, weights: NDArray[np.float32]
-) -> tuple[int, tuple[int, int, int, int, int, int]]:
+def gather_taps(moved: Singles, x: int, weights: Singles) -> tuple[int, tuple[int, int, int, int, int, int]]:
     """Write the weights of the taps that the neighbours from `x` on need; return how many neighbours, and the taps.
 
     These are the lowest along z, y, x and how many follow along each. As many neighbours as `MOST_TAPS` serve: where
@@ -264,7 +258,7 @@ def gather_taps(
 
 
 @njit(cache=True, fastmath=True, **COUNT_NO_REFERENCES)
-def taps_of(places: NDArray[np.float32]) -> tuple[int, int]:
+def taps_of(places: Singles) -> tuple[int, int]:
     """Return the lowest tap whose B-spline matters at some of the places, and how many there are from it on."""
     low = high = places[0]
     for k in range(places.size):
@@ -274,7 +268,7 @@ def taps_of(places: NDArray[np.float32]) -> tuple[int, int]:
 
 
 @njit(cache=True, fastmath=True, **COUNT_NO_REFERENCES)
-def write_splines(places: NDArray[np.float32], low: int, taps: int, weights: NDArray[np.float32]) -> None:
+def write_splines(places: Singles, low: int, taps: int, weights: Singles) -> None:
     """Write the cubic B-splines B centred on each tap at `NEIGHBOURS` places, tap after tap from `low` on.
 
     B(s) = [max(0, 2 - |s|)^3 - 4 max(0, 1 - |s|)^3] / 6.
@@ -289,10 +283,10 @@ def write_splines(places: NDArray[np.float32], low: int, taps: int, weights: NDA
 
 @njit(cache=True, fastmath=True, **COUNT_NO_REFERENCES)
 def interpolate(
-    sums: NDArray[np.float32],
-    volumes: tuple[NDArray[np.float32], NDArray[np.float32]],
+    sums: Singles,
+    volumes: tuple[Singles, Singles],
     place: tuple[int, int, int],
-    weights: NDArray[np.float32],
+    weights: Singles,
     taps: tuple[int, int, int, int, int, int],
 ) -> None:
     """Interpolate two volumes a and b at mirrored places: b towards the taps, a as far away in the opposite direction.
@@ -328,9 +322,7 @@ def interpolate(
 
 
 @njit(cache=True)
-def bound_row(
-    half: NDArray[np.float32], shape: Triple, z: int, y: int, moved: NDArray[np.float32], valid: NDArray[np.uint8]
-) -> None:
+def bound_row(half: Singles, shape: Triple, z: int, y: int, moved: Singles, valid: NDArray[np.uint8]) -> None:
     """Write the half displacements of a row cut off where a source would leave the volume, and which ones are whole.
 
     The neighbours beyond its end repeat its last voxel. Cut off at the centres of the outermost voxels, not at their

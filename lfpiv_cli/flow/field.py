@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from lfpiv_cli.arrays import Floats
+from lfpiv_cli.arrays import Floats, Integers
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.robust import HALF_NORMAL_MEDIAN
@@ -145,7 +145,7 @@ class Statistics:
 
     mean: VectorField
     rms_voxel: Floats
-    samples: NDArray[np.int64]
+    samples: Integers
 
 
 def statistics_of(fields: Iterable[VectorField]) -> Statistics:

@@ -21,7 +21,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from lfpiv_cli.arrays import Floats
+from lfpiv_cli.arrays import Floats, Singles
 from lfpiv_cli.flow.sums import WeightedVoxels, weight_matrices, weighted_sums
 from lfpiv_cli.flow.windows import Starts, Triple, WindowLayout, cells_of, triple
 from lfpiv_cli.threads import COUNT_NO_REFERENCES, share_out
@@ -42,12 +42,10 @@ SMALLEST_PIVOT = 1e-6
 # With a smaller response the volumes' slopes have next to nothing in common: errors stated are then large enough.
 SMALLEST_RESPONSE = 0.25
 
-Row = NDArray[np.float32]
+Row = Singles
 
 
-def pair_moments(
-    a: NDArray[np.float32], b: NDArray[np.float32], valid: NDArray[np.uint8], layout: WindowLayout, before: Triple
-) -> Floats:
+def pair_moments(a: Singles, b: Singles, valid: NDArray[np.uint8], layout: WindowLayout, before: Triple) -> Floats:
     """Return the moments of all cells of two deformed volumes; of several pairs these add up.
 
     Parameters
@@ -66,7 +64,7 @@ def pair_moments(
     weights = weight_matrices(layout, cells)
     here, steps = WeightedVoxels(first, weights), ((0, 0, 1), (0, 1, 0), (1, 0, 0))
 
-    def moments_of(z: int) -> Iterator[NDArray[np.float32]]:
+    def moments_of(z: int) -> Iterator[Singles]:
         """The terms of `sum_cells`, in its order."""
         mean, difference = 0.5 * (here.of(a, z) + here.of(b, z)), here.of(b, z) - here.of(a, z)
         kept, of_mean, of_difference = here.of(valid, z).astype(np.float32), [], []
@@ -87,7 +85,7 @@ def pair_moments(
 @njit(cache=True, nogil=True)
 def sum_cells(
     part: tuple[int, int],
-    pair: tuple[NDArray[np.float32], NDArray[np.float32]],
+    pair: tuple[Singles, Singles],
     valid: NDArray[np.uint8],
     first: Triple,
     start: Starts,

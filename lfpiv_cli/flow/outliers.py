@@ -13,7 +13,7 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, correlate1d
 
-from lfpiv_cli.arrays import Floats
+from lfpiv_cli.arrays import Flags, Floats, Integers
 from lfpiv_cli.flow.field import MASKED, REJECTED, REPLACED, SECOND_PEAK, VALID
 from lfpiv_cli.flow.peaks import typical_width
 from lfpiv_cli.flow.windows import Triple
@@ -127,7 +127,7 @@ NEIGHBOURHOOD = 27
 LANES = 32
 
 
-def sorting_network(count: int) -> NDArray[np.int64]:
+def sorting_network(count: int) -> Integers:
     """Return Batcher's odd-even merge sort of `count` values: pairs (n, 2) to be put in order one after the other."""
     pairs = []
     length = 1
@@ -155,7 +155,7 @@ def expected_noise(width: Floats) -> Floats:
 
 
 def validate_vectors(
-    raw: Floats, second: Floats, measured: NDArray[np.bool_], masked: NDArray[np.bool_], noise: Floats
+    raw: Floats, second: Floats, measured: Flags, masked: Flags, noise: Floats
 ) -> tuple[Floats, NDArray[np.uint8]]:
     """Return the validated displacements and their flags.
 
@@ -264,14 +264,7 @@ def robust_slopes(values: Floats, stride: int, slopes: Floats, middle: Floats) -
 
 
 @njit(cache=True)
-def gather(
-    field: Floats,
-    usable: NDArray[np.bool_],
-    counted: NDArray[np.bool_],
-    places: NDArray[np.int64],
-    cubes: Floats,
-    share: Floats,
-) -> None:
+def gather(field: Floats, usable: Flags, counted: Flags, places: Integers, cubes: Floats, share: Floats) -> None:
     """Write the usable neighbours of up to `LANES` vectors, (3, NEIGHBOURHOOD, LANES), infinity for the others.
 
     Also their share among those that count; arguments as of `predict`, `places` being flat indices.
@@ -294,9 +287,7 @@ def gather(
         share[lane] = used / possible if used else 0.0
 
 
-def predict(
-    field: Floats, usable: NDArray[np.bool_], counted: NDArray[np.bool_], wanted: NDArray[np.int64]
-) -> tuple[Floats, Floats, Floats]:
+def predict(field: Floats, usable: Flags, counted: Flags, wanted: Integers) -> tuple[Floats, Floats, Floats]:
     """Return what the usable neighbours of each wanted vector predict for it.
 
     Parameters
@@ -325,9 +316,9 @@ def predict(
 def predict_tiles(
     part: tuple[int, int],
     field: Floats,
-    usable: NDArray[np.bool_],
-    counted: NDArray[np.bool_],
-    wanted: NDArray[np.int64],
+    usable: Flags,
+    counted: Flags,
+    wanted: Integers,
     out: tuple[Floats, Floats, Floats],
 ) -> None:
     """Write what `predict` returns for tiles `part` of `LANES` wanted vectors each, (tiles, 3, LANES); see there."""

@@ -10,9 +10,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
-from lfpiv_cli.arrays import Floats
+from lfpiv_cli.arrays import Flags, Floats
 from lfpiv_cli.flow.field import VectorField
 from lfpiv_cli.reference import Reference
 from lfpiv_cli.scale import Scale
@@ -73,7 +72,7 @@ class Peaks:
     width: Floats
 
     @property
-    def found(self) -> NDArray[np.bool_]:
+    def found(self) -> Flags:
         """Where there is a peak at all."""
         return self.height > 0.0
 

@@ -23,7 +23,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from lfpiv_cli.arrays import Floats
+from lfpiv_cli.arrays import Floats, Singles
 from lfpiv_cli.flow.windows import Cells, Starts, Triple, WindowLayout, cells_of, triple
 from lfpiv_cli.robust import of_half_the_sum
 from lfpiv_cli.threads import COUNT_NO_REFERENCES, in_threads, share_out
@@ -40,7 +40,7 @@ SMALLEST_ENERGY = 1e-9
 SMALLEST_AMPLITUDE = 0.07
 
 
-WindowWeights = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]
+WindowWeights = tuple[Singles, Singles, Singles]
 
 
 def margins(layout: WindowLayout, shape_zyx: Triple, radius: int) -> tuple[Triple, Triple]:
@@ -66,8 +66,8 @@ class MapSums:
     """
 
     products: Floats
-    energies_a: NDArray[np.float32]
-    energies_b: NDArray[np.float32]
+    energies_a: Singles
+    energies_b: Singles
     blocks: Cells
 
     def __add__(self, other: MapSums) -> MapSums:
@@ -97,9 +97,7 @@ class MapSums:
         return maps
 
 
-def map_sums(
-    a: NDArray[np.float32], b: NDArray[np.float32], layout: WindowLayout, before: Triple, radius: int
-) -> MapSums:
+def map_sums(a: Singles, b: Singles, layout: WindowLayout, before: Triple, radius: int) -> MapSums:
     """Return the sums that R is made of for all shifts up to `radius`, those along z, y, x last.
 
     For one row of blocks the products are first summed over its planes and rows, many columns and several shifts at
@@ -123,7 +121,7 @@ def map_sums(
     weights = weight_matrices(layout, blocks)
     here = WeightedVoxels(first, weights)
 
-    def products_of(z: int) -> Iterator[NDArray[np.float32]]:
+    def products_of(z: int) -> Iterator[Singles]:
         still_a, still_b = here.of(a, z), here.of(b, z)
         for shift in np.ndindex(shifts, shifts, shifts):
             dz, dy, dx = (each - radius for each in shift)
@@ -163,9 +161,7 @@ def weight_matrices(layout: WindowLayout, cells: Cells, radius: int = 0) -> Wind
     return matrices[0], matrices[1], matrices[2]
 
 
-def weighted_sums(
-    fields: int, plane: Callable[[int], Iterable[NDArray[np.float32]]], weights: WindowWeights
-) -> NDArray[np.float32]:
+def weighted_sums(fields: int, plane: Callable[[int], Iterable[Singles]], weights: WindowWeights) -> Singles:
     """Return sums (z, fields, y, x) over weighted windows of fields that are made plane by plane, (rows, columns)."""
     along_z, along_y, along_x = weights
     lateral = np.empty((along_z.shape[1], fields, len(along_y), len(along_x)), dtype=np.float32)
@@ -178,9 +174,7 @@ def weighted_sums(
     return np.tensordot(along_z, lateral, axes=1)
 
 
-def energies_of(
-    volume: NDArray[np.float32], layout: WindowLayout, before: Triple, radius: int = 0
-) -> NDArray[np.float32]:
+def energies_of(volume: Singles, layout: WindowLayout, before: Triple, radius: int = 0) -> Singles:
     """Return the sums of squares over shifted windows: (windows z, shifts z, windows x, shifts x, windows y, shifts y).
 
     One axis after the other. Differences of running sums would take less, but an empty window next to bright ones must
@@ -214,13 +208,7 @@ def valid_shares(valid: NDArray[np.uint8], layout: WindowLayout, before: Triple)
 
 @njit(cache=True, nogil=True)
 def sum_laterally(
-    part: tuple[int, int],
-    volume: NDArray[np.float32],
-    first: Triple,
-    size: Triple,
-    step: Triple,
-    radius: int,
-    lateral: NDArray[np.float32],
+    part: tuple[int, int], volume: Singles, first: Triple, size: Triple, step: Triple, radius: int, lateral: Singles
 ) -> None:
     """Write the sums of squares over the rows and columns of windows, planes `part` of (z, columns, rows)."""
     shifts, lowest = 2 * radius + 1, first[0] - radius
@@ -240,7 +228,7 @@ def sum_laterally(
 
 
 @njit(cache=True)
-def sum_ahead(values: NDArray[np.float32], spare: NDArray[np.float32], size: int, sums: NDArray[np.float32]) -> None:
+def sum_ahead(values: Singles, spare: Singles, size: int, sums: Singles) -> None:
     """Write the sum of the `size` values from each place on to `sums`; nothing of use near the end.
 
     By sums of one, two, four ... values. All are flat and equally long; `values` and `spare` are overwritten.
@@ -261,7 +249,7 @@ def sum_ahead(values: NDArray[np.float32], spare: NDArray[np.float32], size: int
 
 
 @njit(cache=True, nogil=True)
-def sum_rows(rows: NDArray[np.float32], first: int, size: int, radius: int, sums: NDArray[np.float32]) -> None:
+def sum_rows(rows: Singles, first: int, size: int, radius: int, sums: Singles) -> None:
     """Write sums of `size` rows of (rows, columns), those from first + shift on for each shift up to `radius`.
 
     The rows that all shifts share are summed once.
@@ -290,7 +278,7 @@ def sum_rows(rows: NDArray[np.float32], first: int, size: int, radius: int, sums
 def write_maps(
     part: tuple[int, int],
     blocks: Floats,
-    energies: tuple[NDArray[np.float32], NDArray[np.float32]],
+    energies: tuple[Singles, Singles],
     per_window: tuple[int, int],
     hop: tuple[int, int],
     least: float,
@@ -326,7 +314,7 @@ def write_maps(
 
 
 @njit(cache=True)
-def add_row(target: NDArray[np.float32], row: NDArray[np.float32]) -> None:
+def add_row(target: Singles, row: Singles) -> None:
     """Add a row to another, as far as it goes."""
     for i in range(row.size):
         target[i] += row[i]
@@ -334,12 +322,7 @@ def add_row(target: NDArray[np.float32], row: NDArray[np.float32]) -> None:
 
 @njit(cache=True, nogil=True)
 def sum_products(
-    part: tuple[int, int],
-    pair: tuple[NDArray[np.float32], NDArray[np.float32]],
-    first: Triple,
-    start: Starts,
-    size: Starts,
-    found: Floats,
+    part: tuple[int, int], pair: tuple[Singles, Singles], first: Triple, start: Starts, size: Starts, found: Floats
 ) -> None:
     """Write the products of `MapSums` for the rows of blocks `part`."""
     a, b = pair
@@ -389,13 +372,7 @@ def sum_products(
 
 @njit(cache=True, fastmath=True, **COUNT_NO_REFERENCES)
 def add_products(
-    target: NDArray[np.float32],
-    a: NDArray[np.float32],
-    b: NDArray[np.float32],
-    b_there: NDArray[np.float32],
-    a_back: NDArray[np.float32],
-    columns: int,
-    shifts: int,
+    target: Singles, a: Singles, b: Singles, b_there: Singles, a_back: Singles, columns: int, shifts: int
 ) -> None:
     """Add a(x) b(x + s) + a(x - s) b(x) of one row for shifts that follow each other, `COLUMNS` apart in `target`.
 

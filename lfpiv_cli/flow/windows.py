@@ -12,9 +12,8 @@ from math import gcd
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
-from lfpiv_cli.arrays import Floats
+from lfpiv_cli.arrays import Flags, Floats, Integers
 from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.grid import Grid
 
@@ -33,7 +32,7 @@ class ParallelWalls:
 
     width_mm: float
 
-    def contain(self, points_mm: Floats) -> NDArray[np.bool_]:
+    def contain(self, points_mm: Floats) -> Flags:
         """Return which points (..., 3) lie between the walls or on them."""
         return np.asarray(np.abs(points_mm[..., 2]) <= 0.5 * self.width_mm)
 
@@ -88,7 +87,7 @@ class RoundWall:
         relative, direction = points_mm - np.asarray(self.centre_mm), self.direction
         return np.asarray(np.linalg.norm(relative - (relative @ direction)[..., np.newaxis] * direction, axis=-1))
 
-    def contain(self, points_mm: Floats) -> NDArray[np.bool_]:
+    def contain(self, points_mm: Floats) -> Flags:
         """Return which points (..., 3) lie in the pipe or on its wall."""
         return np.asarray(self.distances_mm(points_mm) <= self.radius_mm)
 
@@ -137,7 +136,7 @@ class RoundWall:
 Walls = ParallelWalls | RoundWall
 
 
-def inside(grid: Grid, walls: Walls) -> NDArray[np.bool_]:
+def inside(grid: Grid, walls: Walls) -> Flags:
     """Return the voxels (nz, ny, nx) whose centres lie in the fluid."""
     # plane by plane: the places of all voxels together take more memory than the volume
     plane = Grid((*grid.shape_xyz[:2], 1), grid.spacing_mm, (*grid.origin_mm[:2], 0.0)).centres_mm()[0]
@@ -255,7 +254,7 @@ SMALLEST_BLOCK = 4
 # Cells along an axis of a window, at least, where it has as many voxels: groups enough for a variance.
 CELLS_PER_WINDOW = 4
 
-Starts = tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]
+Starts = tuple[Integers, Integers, Integers]
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Flags, Singles
 from lfpiv_cli.console import Console
 from lfpiv_cli.files.config import load_config
 from lfpiv_cli.files.images import read_image, write_tiff
@@ -28,7 +28,7 @@ from lfpiv_cli.verbs.simulate import frame_names, simulate_board, simulate_parti
 from lfpiv_cli.verbs.validate import measured_of
 
 
-def beside_wall(measured: Measured, duct: Duct) -> NDArray[np.bool_]:
+def beside_wall(measured: Measured, duct: Duct) -> Flags:
     """Return which windows (nz, ny, nx) lie beyond `PAPERS_WALL` of the width, of those that are judged."""
     axis = duct.across["x/D"]
     places = measured.field.grid.centres_mm()[..., axis]
@@ -139,7 +139,7 @@ def _simulated(clean: Path, with_bubbles: Path, work: Work) -> dict[str, Any]:
     return {"pixels_left_out": int(left_out.sum())}
 
 
-def _pair(work: Work) -> list[NDArray[np.float32]]:
+def _pair(work: Work) -> list[Singles]:
     """Return the images with bubbles."""
     return [read_image(work.folder / "bubbles" / name) for name in frame_names(2)]
 

@@ -12,9 +12,8 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from lfpiv_cli.arrays import Floats
+from lfpiv_cli.arrays import Flags, Floats, Singles
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.pictures.style import (
     BLUE,
@@ -49,7 +48,7 @@ SHOWN_DEPTHS = 2.0
 DECIMALS = 3
 
 
-def board_view(volume: NDArray[np.float32], grid: Grid) -> dict[str, Floats]:
+def board_view(volume: Singles, grid: Grid) -> dict[str, Floats]:
     """Return a reconstructed board [z, y, x] as it is seen, its brightest voxel 1, rounded as a page shows it.
 
     Returns
@@ -241,7 +240,7 @@ CASE_STYLES = ((BLUE, "o"), (VERMILION, "s"), (GREEN, "^"), (PURPLE, "v"), (ORAN
 
 
 @styled
-def raw_figure(image: NDArray[np.float32], mask: NDArray[np.bool_]) -> Figure:
+def raw_figure(image: Singles, mask: Flags) -> Figure:
     """Return a part of a raw image with bubbles, alone and with the outline of what a mask leaves out."""
     figure, panels = new_panels(10.0, 10.0 * 0.5 * image.shape[0] / image.shape[1] + 1.0, 1, 2)
     highest = float(np.percentile(image[~mask], 99.9)) if not mask.all() else float(image.max())
@@ -304,6 +303,6 @@ def wall_profile_figure(methods: Mapping[str, Measured], duct: Duct) -> Figure:
     return figure
 
 
-def _mean_over(values: Floats, inside: NDArray[np.bool_], axis: int) -> Floats:
+def _mean_over(values: Floats, inside: Flags, axis: int) -> Floats:
     """Return the means (n,) over planes across an axis (0 for x) of values [z, y, x], of what is known inside."""
     return mean_of_known(np.where(inside, values, np.nan), tuple(k for k in range(3) if k != 2 - axis))

@@ -12,9 +12,8 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
-from lfpiv_cli.arrays import Floats
+from lfpiv_cli.arrays import Floats, Singles
 from lfpiv_cli.calibration.board_pose import BoardGeometry
 from lfpiv_cli.calibration.model import Channel, advised_move_mm, mid_plane_z_mm
 from lfpiv_cli.flow.correlation import correlate
@@ -43,7 +42,7 @@ from lfpiv_cli.weights.model import Weights
 
 # Axes: (x, y, z) in mm, z away from the camera from where the channel's mid plane is (or is believed to be).
 
-Image = NDArray[np.float32]
+Image = Singles
 Points = Floats
 Figures = dict[str, float]
 

@@ -11,9 +11,8 @@ from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from lfpiv_cli.arrays import Floats
+from lfpiv_cli.arrays import Floats, Integers
 from lfpiv_cli.notice import written
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.curved_space import CurvedSpace
@@ -161,7 +160,7 @@ def displacement_lines(position_mm: Floats, displacement_mm: Floats) -> tuple[li
     return list(np.stack([position_mm - half, position_mm + half], axis=1)), stretch
 
 
-def trajectory_lines(position_mm: Floats, track: NDArray[np.int64]) -> list[Floats]:
+def trajectory_lines(position_mm: Floats, track: Integers) -> list[Floats]:
     """Return the places (m, 3) of each track in time; rows are ordered by track, then by frame."""
     return np.split(position_mm, np.flatnonzero(np.diff(track)) + 1) if len(track) else []
 
@@ -230,7 +229,7 @@ def sigma_figure(z_mm: Floats, sigma_m_s: Floats) -> style.Figure:
 
 
 @style.styled
-def lengths_figure(track: NDArray[np.int64]) -> style.Figure:
+def lengths_figure(track: Integers) -> style.Figure:
     """How many frames the trajectories span."""
     lengths = np.unique(track, return_counts=True)[1]
     figure, axes = style.new_panels(6.0, 3.6)

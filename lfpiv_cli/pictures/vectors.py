@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lfpiv_cli.arrays import Floats
+from lfpiv_cli.arrays import Floats, Integers, Singles
 from lfpiv_cli.flow.field import (
     FLAG_NAMES,
     MASKED,
@@ -371,9 +371,7 @@ BRIGHT_PERCENT = 99.8
 
 
 @style.styled
-def column_figure(
-    pixels: tuple[NDArray[np.int64], NDArray[np.int64]], weights: NDArray[np.float32], pixel_mm: float, title: str
-) -> style.Figure:
+def column_figure(pixels: tuple[Integers, Integers], weights: Singles, pixel_mm: float, title: str) -> style.Figure:
     """Return one voxel's column as the sensor would see it, against pixels' numbers and mm on the sensor.
 
     Parameters
@@ -413,7 +411,7 @@ def light_figure(z_mm: Floats, sums: Mapping[str, Floats]) -> style.Figure:
 
 
 @style.styled
-def projections_figure(volume: NDArray[np.float32], grid: Grid) -> style.Figure:
+def projections_figure(volume: Singles, grid: Grid) -> style.Figure:
     """The brightest voxel along each line of sight, in the three directions, on one scale."""
     figure, axes = plane_panels(grid)
     # Along an axis that a plane is across, nothing is left but the plane.
@@ -426,7 +424,7 @@ def projections_figure(volume: NDArray[np.float32], grid: Grid) -> style.Figure:
 
 
 @style.styled
-def depths_figure(volume: NDArray[np.float32], grid: Grid) -> style.Figure:
+def depths_figure(volume: Singles, grid: Grid) -> style.Figure:
     """The mean intensity of each plane by depth."""
     figure, axes = style.new_panels(6.0, 3.6)
     axes.plot(grid.axis_mm(2), volume.mean(axis=(1, 2), dtype=np.float64))

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from lfpiv_cli.arrays import Floats
+from lfpiv_cli.arrays import Floats, Singles
 from lfpiv_cli.calibration.board_pose import BoardGeometry
 from lfpiv_cli.calibration.shape_fit import nearest_points
 from lfpiv_cli.calibration.views import charuco_board
@@ -58,7 +58,7 @@ class Plate:
     middle_mm: Floats
     along_x: Floats
     along_y: Floats
-    picture: NDArray[np.float32]
+    picture: Singles
     samples_per_mm: float
 
 

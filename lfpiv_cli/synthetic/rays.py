@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import brentq
 from scipy.special import ndtri
 
-from lfpiv_cli.arrays import Floats
+from lfpiv_cli.arrays import Flags, Floats
 from lfpiv_cli.optics.camera import Camera, KernelCamera, Objective
 from lfpiv_cli.optics.curved_space import CurvedSpace
 from lfpiv_cli.optics.ray_bundles import aim, aim_all
@@ -295,7 +295,7 @@ def fit_of_slopes() -> tuple[Floats, Floats]:
     return places, np.asarray(np.linalg.pinv(terms), dtype=np.float64)
 
 
-def unseen(camera: Camera, space: CurvedSpace, points_mm: ArrayLike) -> NDArray[np.bool_]:
+def unseen(camera: Camera, space: CurvedSpace, points_mm: ArrayLike) -> Flags:
     """Return which points (n, 3), world axes, no ray leads from to the lens: not in the fluid, or behind a rim."""
     points = camera.to_image_axes(points_mm).reshape(-1, 3)
     is_unseen = np.ones(len(points), dtype=np.bool_)

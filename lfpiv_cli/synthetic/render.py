@@ -21,7 +21,7 @@ from scipy import fft
 from scipy.ndimage import map_coordinates
 from scipy.special import ndtr, ndtri
 
-from lfpiv_cli.arrays import Floats
+from lfpiv_cli.arrays import Floats, Integers
 from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.optics.camera import Camera, KernelCamera, Objective, nearest_point
 from lfpiv_cli.optics.curved_space import CurvedSpace
@@ -273,7 +273,7 @@ def _backtrack_white(
     objective: Objective,
     origin_px: Floats,
     basis_px: Floats,
-    lit: NDArray[np.int64],
+    lit: Integers,
 ) -> None:
     """Write how many samples of each pixel, rows `part`, come from the aperture, summed over the lenses."""
     columns, pixel = camera.columns, camera.pixel_mm

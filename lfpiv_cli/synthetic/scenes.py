@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from lfpiv_cli.arrays import Floats
+from lfpiv_cli.arrays import Flags, Floats
 from lfpiv_cli.calibration.board_pose import BoardGeometry
 from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.flow.windows import RoundWall, Walls
@@ -153,7 +153,7 @@ class Tracers:
         variance = np.log1p(self.brightness_flicker**2)
         return rng.lognormal(-0.5 * variance, np.sqrt(variance), (frames, self.count))
 
-    def lit(self, points_mm: Floats) -> NDArray[np.bool_]:
+    def lit(self, points_mm: Floats) -> Flags:
         """Return which of the points (..., 3) lie in the light."""
         if self.light_z_mm is None:
             return np.ones(points_mm.shape[:-1], dtype=np.bool_)

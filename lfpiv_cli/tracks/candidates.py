@@ -10,11 +10,10 @@ from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial import KDTree
 
-from lfpiv_cli.arrays import Floats
+from lfpiv_cli.arrays import Flags, Floats, Integers
 
 # What the light of two particles says of their being one.
 #
@@ -90,9 +89,7 @@ class Peak(NamedTuple):
         return (1.0 - TAIL_SHARE) * near + TAIL_SHARE * far
 
 
-def light_ratio(
-    first: Light | None, second: Light | None, owner: NDArray[np.int64], target: NDArray[np.int64]
-) -> Floats:
+def light_ratio(first: Light | None, second: Light | None, owner: Integers, target: Integers) -> Floats:
     """Return for pairs (c,) how much more likely their light is if they are one; 1 where light tells nothing.
 
     Parameters
@@ -227,12 +224,12 @@ class Candidates:
     light_ratio : (c,) how much more likely their light is if they are one than if they are any two
     """
 
-    first: NDArray[np.int64]
-    second: NDArray[np.int64]
+    first: Integers
+    second: Integers
     displacement_mm: Floats
     light_ratio: Floats
 
-    def part(self, chosen: NDArray[np.bool_]) -> Candidates:
+    def part(self, chosen: Flags) -> Candidates:
         """Return some of the pairs."""
         return Candidates(
             self.first[chosen], self.second[chosen], self.displacement_mm[chosen], self.light_ratio[chosen]
@@ -273,18 +270,18 @@ class Trajectories:
     probability : for each frame (n,) that of the link by which a track has come to each particle; NaN where it begins
     """
 
-    labels: tuple[NDArray[np.int64], ...]
+    labels: tuple[Integers, ...]
     count: int
     probability: tuple[Floats, ...]
 
-    def particles(self, frame: int, tracks: NDArray[np.int64]) -> NDArray[np.int64]:
+    def particles(self, frame: int, tracks: Integers) -> Integers:
         """Return the numbers of the particles in a frame that tracks have there, `NO_PARTICLE` for none."""
         labels = self.labels[frame]
         place = np.full(self.count, NO_PARTICLE)
         place[labels[labels != NO_TRACK]] = np.flatnonzero(labels != NO_TRACK)
         return np.asarray(place[tracks])
 
-    def lengths(self) -> NDArray[np.int64]:
+    def lengths(self) -> Integers:
         """Return how many places each track has."""
         counts = np.zeros(self.count, dtype=np.int64)
         for labels in self.labels:
@@ -304,15 +301,13 @@ class Trajectories:
         return float(np.sum(wrong))
 
 
-def tracks_in(found: Trajectories, window: Sequence[int]) -> NDArray[np.int64]:
+def tracks_in(found: Trajectories, window: Sequence[int]) -> Integers:
     """Return the numbers of the tracks that pass some frames."""
     numbers = np.unique(np.concatenate([found.labels[k] for k in window]))
     return numbers[numbers != NO_TRACK]
 
 
-def places(
-    found: Trajectories, frames: Frames, window: Sequence[int], tracks: NDArray[np.int64]
-) -> tuple[Floats, Floats]:
+def places(found: Trajectories, frames: Frames, window: Sequence[int], tracks: Integers) -> tuple[Floats, Floats]:
     """Return places and standard errors (n, m, 3) of tracks in the frames of a window; NaN where there are none."""
     position, sigma = (np.full((len(tracks), len(window), 3), np.nan) for _ in range(2))
     for column, frame in enumerate(window):

@@ -18,12 +18,11 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import nnls
 from scipy.spatial import KDTree
 from scipy.special import chdtr, gammaincinv
 
-from lfpiv_cli.arrays import Floats
+from lfpiv_cli.arrays import Floats, Integers
 from lfpiv_cli.robust import MAD_TO_SIGMA
 from lfpiv_cli.threads import blocks, in_threads
 
@@ -95,7 +94,7 @@ def structure_of(points: Floats, displacement: Floats, noise2: Floats) -> Struct
 
 
 def kriged(
-    at: Floats, own: NDArray[np.int64], points: Floats, displacement: Floats, noise2: Floats, structure: Structure
+    at: Floats, own: Integers, points: Floats, displacement: Floats, noise2: Floats, structure: Structure
 ) -> tuple[Floats, Floats]:
     """Return the displacements (m, 3) that neighbours let expect, and the variance (m, 3) of what they miss.
 
@@ -157,7 +156,7 @@ def spread_around(at: Floats, points: Floats, off: Floats) -> Floats:
     return np.asarray(MAD_TO_SIGMA * np.median(off[near], axis=1))
 
 
-def without_own(near: NDArray[np.int64], own: NDArray[np.int64]) -> NDArray[np.int64]:
+def without_own(near: Integers, own: Integers) -> Integers:
     """Return all but one of the numbers of each row: its own, or else the last."""
     is_own = near == own[:, np.newaxis]
     drop = np.where(is_own.any(axis=1), is_own.argmax(axis=1), near.shape[1] - 1)
@@ -410,7 +409,7 @@ def _best(found: Choices, nodes_mm: Floats, choices: list[tuple[int, int]]) -> t
     return value, np.sqrt(smallest)
 
 
-def _excess(difference: Floats, noise2: Floats, together: NDArray[np.int64]) -> Floats:
+def _excess(difference: Floats, noise2: Floats, together: Integers) -> Floats:
     """Return by how much the mean square of differences (m, 3), over nodes that go together, exceeds their noise."""
     dropped = int(TRIMMED * together.shape[1])
     kept = np.sort((difference**2)[together], axis=1)[:, : together.shape[1] - dropped].mean(axis=1)

@@ -15,10 +15,9 @@ from dataclasses import dataclass
 from math import factorial
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import gammaincinv
 
-from lfpiv_cli.arrays import Floats
+from lfpiv_cli.arrays import Floats, Integers
 from lfpiv_cli.robust import MAD_TO_SIGMA
 from lfpiv_cli.tracks.candidates import NO_TRACK, Seen, Trajectories
 
@@ -79,7 +78,7 @@ class Motion:
 
 def motions_at(
     found: Trajectories, frames: Sequence[Seen], frame: int, derivatives: HighDerivatives
-) -> tuple[NDArray[np.int64], Motion]:
+) -> tuple[Integers, Motion]:
     """Return the tracks that have a place in a frame and two more in the window about it, and their motion there."""
     numbers = found.labels[frame]
     numbers = np.unique(numbers[numbers != NO_TRACK])
@@ -117,7 +116,7 @@ def high_derivatives_in(found: Trajectories, frames: Sequence[Seen]) -> HighDeri
 
 
 def places_with_covariances(
-    found: Trajectories, frames: Sequence[Seen], window: Sequence[int], tracks: NDArray[np.int64]
+    found: Trajectories, frames: Sequence[Seen], window: Sequence[int], tracks: Integers
 ) -> tuple[Floats, Floats]:
     """Return places (n, m, 3) of tracks in the frames of a window, and their covariances (n, m, 3, 3).
 

@@ -13,9 +13,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from lfpiv_cli.arrays import Floats
+from lfpiv_cli.arrays import Floats, Integers
 from lfpiv_cli.robust import MAD_TO_SIGMA
 from lfpiv_cli.scale import Scale
 from lfpiv_cli.tracks.candidates import NO_PARTICLE, NO_TRACK, Frames, Seen, Trajectories, long_ones, places, tracks_in
@@ -221,7 +220,7 @@ def scatter_in(found: Trajectories, frames: Sequence[Seen]) -> tuple[Scatter, in
 
 def states_at(
     found: Trajectories, frames: Sequence[Seen], time: float, scatter: Scatter, half_frames: int
-) -> tuple[NDArray[np.int64], State]:
+) -> tuple[Integers, State]:
     """Return the tracks that pass a time, given in frames, and their states then.
 
     Half-way between two frames these are the tracks with a place before and one after, at most two frames apart, and

@@ -16,10 +16,9 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from lfpiv_cli.arrays import Floats
+from lfpiv_cli.arrays import Flags, Floats, Integers
 from lfpiv_cli.robust import MAD_TO_SIGMA
 from lfpiv_cli.scale import Scale
 from lfpiv_cli.threads import share_out
@@ -81,10 +80,10 @@ def votes(points: Floats, candidates: Candidates, density_per_mm3: float, scale:
 @njit(cache=True, nogil=True)
 def _support(
     part: tuple[int, int],
-    begin: NDArray[np.int64],
+    begin: Integers,
     displacement: Floats,
     ratio: Floats,
-    neighbours: NDArray[np.int64],
+    neighbours: Integers,
     widths: Floats,
     heights: Floats,
     support: Floats,
@@ -121,7 +120,7 @@ MOST_ROUNDS = 200
 SETTLED = 1e-6
 
 
-def marginals(first: NDArray[np.int64], second: NDArray[np.int64], odds: Floats, sizes: tuple[int, int]) -> Floats:
+def marginals(first: Integers, second: Integers, odds: Floats, sizes: tuple[int, int]) -> Floats:
     """Return the probability of each pair (c,).
 
     Parameters
@@ -183,8 +182,8 @@ class Tracks:
     probability : (n,) of the links, from the alternatives
     """
 
-    first: NDArray[np.int64]
-    second: NDArray[np.int64]
+    first: Integers
+    second: Integers
     probability: Floats
 
 
@@ -201,7 +200,7 @@ class Known:
     displacement_mm, variance_mm2 : (k, 3)
     """
 
-    number: NDArray[np.int64]
+    number: Integers
     displacement_mm: Floats
     variance_mm2: Floats
 
@@ -256,8 +255,8 @@ def track(first: Seen, second: Seen, search_mm: float, scale: Scale, forecast: F
 
 
 def link_some(
-    first: tuple[Seen, NDArray[np.bool_]],
-    second: tuple[Seen, NDArray[np.bool_]],
+    first: tuple[Seen, Flags],
+    second: tuple[Seen, Flags],
     known: Known,
     search_mm: float,
     scale: Scale,
@@ -276,9 +275,7 @@ def link_some(
     return Tracks(candidates.first[links], candidates.second[links], probability[links])
 
 
-def known_of(
-    first: Seen, second: Seen, at_first: NDArray[np.int64], at_second: NDArray[np.int64], scale: Scale
-) -> Known:
+def known_of(first: Seen, second: Seen, at_first: Integers, at_second: Integers, scale: Scale) -> Known:
     """Return the displacements of linked particles."""
     noise = first.covariance()[at_first, :3] + second.covariance()[at_second, :3]
     displacement = second.position_mm[at_second] - first.position_mm[at_first]

@@ -11,10 +11,9 @@ from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from lfpiv_cli.arrays import Floats
+from lfpiv_cli.arrays import Floats, Singles
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.notice import written
@@ -22,7 +21,7 @@ from lfpiv_cli.pictures.style import Figure, new_panels, styled
 
 
 @styled
-def board_figure(figures: dict[str, Any], volume: NDArray[np.float32], grid: Grid) -> Figure:
+def board_figure(figures: dict[str, Any], volume: Singles, grid: Grid) -> Figure:
     """Return a figure of a board (its light in the plane and from the side) and of the errors by depth.
 
     `volume` [z, y, x] is the reconstruction of the board nearest the focal plane; `figures` are `board_figures`.
@@ -193,7 +192,7 @@ class DotFigures:
         return cls(np.array(values["elongation_mm"]), depths, np.array(values["lateral_mm"]))
 
 
-def measure_dots(volume: NDArray[np.float32], grid: Grid, centres_mm: Floats, reach_mm: float) -> DotFigures:
+def measure_dots(volume: Singles, grid: Grid, centres_mm: Floats, reach_mm: float) -> DotFigures:
     """Measure each dot in the column of voxels within `reach_mm` of its centre (n, 2) in x and y.
 
     Raises

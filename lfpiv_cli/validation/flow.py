@@ -16,10 +16,9 @@ from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from lfpiv_cli.arrays import Floats
+from lfpiv_cli.arrays import Flags, Floats, Integers
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.flow.field import FLAG_NAMES, MM_TO_M, VectorField
 from lfpiv_cli.flow.windows import RoundWall
@@ -52,11 +51,11 @@ class Comparison:
 
     measured: Floats
     true: Floats
-    index_zyx: NDArray[np.int64]
+    index_zyx: Integers
     direction: Floats | None
 
     @property
-    def found(self) -> NDArray[np.bool_]:
+    def found(self) -> Flags:
         """Which windows are no miss, (n,)."""
         return np.asarray(np.isfinite(self.measured).all(axis=1))
 
@@ -74,7 +73,7 @@ class Measured:
 
     field: VectorField
     truth: Floats
-    inside: NDArray[np.bool_]
+    inside: Flags
     flow: Flow | None = None
 
     @cached_property
@@ -105,7 +104,7 @@ class Measured:
         )
 
     @property
-    def found(self) -> NDArray[np.bool_]:
+    def found(self) -> Flags:
         """Which windows (nz, ny, nx) are judged and no miss."""
         return np.asarray(self.inside & np.isfinite(self.field.velocity).all(axis=-1))
 
@@ -190,7 +189,7 @@ def _ratio(error: Floats, size: Floats) -> Floats:
     return ratio
 
 
-def _streamwise_sums(pairs: Comparison, chosen: NDArray[np.bool_]) -> tuple[float, float]:
+def _streamwise_sums(pairs: Comparison, chosen: Flags) -> tuple[float, float]:
     """Return the sums of v and u over chosen windows that were found; both 0 where the flow has no direction."""
     chosen = chosen & pairs.found
     if pairs.direction is None:
@@ -383,6 +382,6 @@ def pipe_figures(measured: Measured, pipe: RoundWall) -> dict[str, Any]:
     return {"within_25_percent_vector_inner": _share(right[inner]), "rings": rings}
 
 
-def _share(right: NDArray[np.bool_]) -> float | None:
+def _share(right: Flags) -> float | None:
     """Return how many of some are right, None of none."""
     return float(right.mean()) if right.size else None

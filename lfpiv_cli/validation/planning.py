@@ -10,11 +10,11 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy import sparse
 from scipy.linalg import cho_factor, cho_solve
 
-from lfpiv_cli.arrays import Floats
+from lfpiv_cli.arrays import Floats, Singles
 from lfpiv_cli.flow.windows import ROUNDING
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.camera import Camera
@@ -38,7 +38,7 @@ CLEAR = 0.5
 SOLVER = SolverSettings("em", 8, accelerate=True)
 
 
-def share_beyond(camera: Camera, media: Media, z_mm: tuple[float, float], light: NDArray[np.float32]) -> float:
+def share_beyond(camera: Camera, media: Media, z_mm: tuple[float, float], light: Singles) -> float:
     """Return the share of an image's light that a longer volume puts before or behind the volume.
 
     Parameters

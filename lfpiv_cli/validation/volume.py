@@ -12,10 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from lfpiv_cli.arrays import Floats
+from lfpiv_cli.arrays import Flags, Floats, Integers, Singles
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.particles.joining import Boxes, find_peaks
@@ -32,8 +31,8 @@ COVERED_SIGMAS = 1.96
 class Matches:
     """Numbers of found and true particles that belong together, (n,) each, and their errors (n, 3) in voxels."""
 
-    found: NDArray[np.int64]
-    true: NDArray[np.int64]
+    found: Integers
+    true: Integers
     error_voxel: Floats
 
 
@@ -74,7 +73,7 @@ def particle_figures(
     distances_mm : only what lies this far from z = 0, the focal plane, on either side is judged
     """
 
-    def inside(points: Floats) -> NDArray[np.bool_]:
+    def inside(points: Floats) -> Flags:
         distance = np.abs(points[:, 2])
         band = (distance >= distances_mm[0]) & (distance < distances_mm[1])
         return np.asarray(band & np.all((points >= low_mm) & (points <= high_mm), axis=1))
@@ -183,7 +182,7 @@ BOXES = Boxes(sum=(3, 1, 1), peak=(3, 3, 3), light=(5, 3, 3))
 
 
 def volume_figures(
-    volume: NDArray[np.float32], grid: Grid, position_mm: Floats, brightness: Floats, microlens_mm: float
+    volume: Singles, grid: Grid, position_mm: Floats, brightness: Floats, microlens_mm: float
 ) -> dict[str, float | int]:
     """Return the figures of a volume whose true particles are known.
 
@@ -237,21 +236,21 @@ def volume_figures(
     return figures
 
 
-def normalised_correlation(first: NDArray[np.float32], second: NDArray[np.float32]) -> float:
+def normalised_correlation(first: Singles, second: Singles) -> float:
     """Return Q = sum(E F) / sqrt(sum(E^2) sum(F^2)), 0 where a volume is dark."""
     product = np.sum(np.multiply(first, second, dtype=np.float64))
     squares = np.sum(np.square(first, dtype=np.float64)) * np.sum(np.square(second, dtype=np.float64))
     return float(product / np.sqrt(squares)) if squares > 0.0 else 0.0
 
 
-def known_volume(grid: Grid, position_mm: Floats, brightness: Floats, sigma_mm: Floats) -> NDArray[np.float32]:
+def known_volume(grid: Grid, position_mm: Floats, brightness: Floats, sigma_mm: Floats) -> Singles:
     """Return particles (n, 3) as Gaussians of standard deviations sigma (3,), each as high as it is bright (n,)."""
     volume = np.zeros(grid.shape_zyx, np.float32)
     add_gaussians(volume, grid.mm_to_voxel(position_mm), brightness, sigma_mm / np.asarray(grid.spacing_mm))
     return volume
 
 
-def shared_among_voxels(grid: Grid, position_mm: Floats, brightness: Floats) -> NDArray[np.float32]:
+def shared_among_voxels(grid: Grid, position_mm: Floats, brightness: Floats) -> Singles:
     """Return particles (n, 3) with their light (n,) shared out among their eight nearest voxels, by distance."""
     volume = np.zeros(grid.shape_zyx)
     index = grid.mm_to_voxel(position_mm)
@@ -264,7 +263,7 @@ def shared_among_voxels(grid: Grid, position_mm: Floats, brightness: Floats) -> 
     return volume.astype(np.float32)
 
 
-def near_a_particle(grid: Grid, position_mm: Floats, microlens_mm: float) -> NDArray[np.bool_]:
+def near_a_particle(grid: Grid, position_mm: Floats, microlens_mm: float) -> Flags:
     """Return which voxels (z, y, x) have their centre in the ellipsoid around a particle."""
     scale = microlens_mm * np.array([1.0, 1.0, DEPTH_TO_LATERAL])
     tree = KDTree(position_mm / scale)
@@ -277,7 +276,7 @@ def near_a_particle(grid: Grid, position_mm: Floats, microlens_mm: float) -> NDA
 
 
 @njit(cache=True)
-def add_gaussians(volume: NDArray[np.float32], centres: Floats, height: Floats, sigma: Floats) -> None:
+def add_gaussians(volume: Singles, centres: Floats, height: Floats, sigma: Floats) -> None:
     """Add Gaussians of heights (n,) to a volume [z, y, x]; `centres` (n, 3) and `sigma` (3,) in voxels (x, y, z)."""
     shape = (volume.shape[2], volume.shape[1], volume.shape[0])
     profile = np.empty((3, int(2.0 * REACH * sigma.max()) + 3))

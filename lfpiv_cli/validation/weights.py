@@ -14,10 +14,9 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 
-from lfpiv_cli.arrays import Floats
+from lfpiv_cli.arrays import Flags, Floats, Integers
 from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.notice import written
@@ -125,7 +124,7 @@ def sample_voxels(grid: Grid, count: int, rng: np.random.Generator) -> Floats:
 
 def judged_voxels(
     camera: Camera, space: Space, grid: Grid, sample: int, rng: np.random.Generator
-) -> tuple[Floats, NDArray[np.bool_]]:
+) -> tuple[Floats, Flags]:
     """Return the centres (n, 3), world axes, of voxels that are compared, and of which (n,) rays are counted for long.
 
     These are the paper's that are in view, with `sample` random ones of the grid. Behind curved faces all are random
@@ -156,7 +155,7 @@ def make_columns(
     grid: Grid,
     centres_mm: Floats,
     rng: np.random.Generator,
-    long_count: NDArray[np.int64],
+    long_count: Integers,
     progress: Callable[[int], None] | None = None,
 ) -> list[Column]:
     """Return the columns of voxels by every way that camera and scene allow.
@@ -224,7 +223,7 @@ def make_columns(
     return columns
 
 
-def weights_figures(columns: list[Column], long_count: NDArray[np.int64]) -> dict[str, Any]:
+def weights_figures(columns: list[Column], long_count: Integers) -> dict[str, Any]:
     """Return for each comparison the mean and the worst of SSIM, RMSE and L1, and the figures of each voxel."""
     voxels = []
     for column, rays in zip(columns, long_count, strict=True):
