@@ -41,13 +41,11 @@ from lfpiv_cli.tracks.gridding import FEWEST_OF_STRUCTURE, ROUGH_EXPONENT, spaci
 #
 # Axes: points (m, 3) and displacements in mm.
 
-
 # The structure function under which the samples are likeliest: what a field is kriged with.
 #
 # The likelihood is that of some neighbourhoods spread over the samples, each with all its covariances about an
 # unknown constant: a few hundred samples, which know both what neighbours differ by and how much of it is error.
 # First guesses with wide standard deviations keep what few samples cannot tell where it is likely to be.
-
 
 # So many neighbourhoods of so many samples, more of which change the estimates by less than their errors; and what
 # is enough to tell outliers.
@@ -297,7 +295,6 @@ UNRESOLVED_CHI2 = 3.0
 # Fewer samples are kriged. Of 500 in smooth flows, kriging is a fifth nearer in u and v, equal in w, and free of
 # divergence, of which the splines' wide knots leave up to 4 % of the gradients; of 1,000, splines are nearer in w.
 FEW_SAMPLES = 600
-
 
 # A velocity field that is known everywhere in a box, as displacements from one frame to the next.
 Field = SplineField | KrigedField

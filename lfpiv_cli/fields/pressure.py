@@ -21,23 +21,10 @@ import numba
 import numpy as np
 
 from lfpiv_cli.arrays import Floats
+from lfpiv_cli.fields import stencils
 from lfpiv_cli.fields.evidence import Box, first_expectation, most_probable
 from lfpiv_cli.fields.fit import Field
 from lfpiv_cli.fields.spline_field import LAST_CHANGE, POINTS_AT_ONCE, ROUNDS, SplineField, gradient_covariance_at
-from lfpiv_cli.fields.stencils import (
-    DEGREE,
-    SECOND,
-    SUPPORT,
-    THIRD,
-    Expectation,
-    Factor,
-    Lattice,
-    Stencil,
-    expected_inverse,
-    factorised,
-    gradient_rows,
-    rows_of,
-)
 from lfpiv_cli.fields.structure import Samples, belonging, error_covariance, squares
 from lfpiv_cli.robust import MAD_TO_SIGMA
 
@@ -46,9 +33,9 @@ from lfpiv_cli.robust import MAD_TO_SIGMA
 # Axes: a gradient's components (x, y, z), per mm.
 
 
-def gradient_at(points_mm: Floats, lattice: Lattice, coefficients: Floats) -> Floats:
+def gradient_at(points_mm: Floats, lattice: stencils.Lattice, coefficients: Floats) -> Floats:
     """Return the gradients (n, 3) of the scalar with coefficients (nx, ny, nz)."""
-    columns, rows = gradient_rows(lattice, points_mm)
+    columns, rows = stencils.gradient_rows(lattice, points_mm)
     return np.asarray(np.einsum("nik,nk->ni", rows, coefficients.ravel()[columns]))
 
 
@@ -60,9 +47,9 @@ class GradientBox(Box):
     integrals: ClassVar[int] = 1
 
     @classmethod
-    def around(cls, lattice: Lattice, samples: Samples) -> Self:
+    def around(cls, lattice: stencils.Lattice, samples: Samples) -> Self:
         """Return the box of a lattice and the samples in it."""
-        columns, values = gradient_rows(lattice, samples.points_mm)
+        columns, values = stencils.gradient_rows(lattice, samples.points_mm)
         splines = np.zeros((len(samples), 3, int(np.prod(lattice.shape))))
         np.put_along_axis(splines, columns[:, np.newaxis], values, axis=2)
         return cls(lattice, samples, splines)
@@ -82,16 +69,16 @@ class GradientBox(Box):
         return np.asarray(np.einsum("nik,njk->nij", self.splines @ inverse, self.splines, optimize=True))
 
 
-def add_gradients(matrix: Stencil, lattice: Lattice, points_mm: Floats, weight: Floats) -> None:
+def add_gradients(matrix: stencils.Stencil, lattice: stencils.Lattice, points_mm: Floats, weight: Floats) -> None:
     """Add the normal equations' matrix of gradients at points (n, 3) with weights (n, 3, 3), inverse covariances."""
-    _, rows = gradient_rows(lattice, points_mm)
+    _, rows = stencils.gradient_rows(lattice, points_mm)
     first, _ = lattice.splines_at(points_mm)
     _add_rows(matrix, first, np.linalg.cholesky(weight).swapaxes(1, 2) @ rows)
 
 
-def right_hand_side(lattice: Lattice, points_mm: Floats, weighted: Floats) -> Floats:
+def right_hand_side(lattice: stencils.Lattice, points_mm: Floats, weighted: Floats) -> Floats:
     """Return the normal equations' right-hand side (nx ny nz,) of weighted gradients (n, 3)."""
-    columns, rows = gradient_rows(lattice, points_mm)
+    columns, rows = stencils.gradient_rows(lattice, points_mm)
     parts = np.einsum("nik,ni->nk", rows, weighted)
     size = int(np.prod(lattice.shape))
     return np.asarray(np.bincount(columns.ravel(), parts.ravel(), minlength=size), dtype=np.float64)
@@ -100,17 +87,17 @@ def right_hand_side(lattice: Lattice, points_mm: Floats, weighted: Floats) -> Fl
 @numba.njit(cache=True, nogil=True)
 def _add_rows(matrix, first, rows):  # type: ignore[no-untyped-def]  # numba
     """Add the squares of rows (n, m, 64), m of each sample, to the matrix of a scalar."""
-    size = SUPPORT * SUPPORT * SUPPORT
+    size = stencils.SUPPORT * stencils.SUPPORT * stencils.SUPPORT
     for sample in range(len(first)):
         for p in range(size):
-            a, b, c = p // SUPPORT**2, p // SUPPORT % SUPPORT, p % SUPPORT
+            a, b, c = p // stencils.SUPPORT**2, p // stencils.SUPPORT % stencils.SUPPORT, p % stencils.SUPPORT
             row = matrix[first[sample, 0] + a, 0, first[sample, 1] + b, first[sample, 2] + c]
             for q in range(size):
-                d, e, f = q // SUPPORT**2, q // SUPPORT % SUPPORT, q % SUPPORT
+                d, e, f = q // stencils.SUPPORT**2, q // stencils.SUPPORT % stencils.SUPPORT, q % stencils.SUPPORT
                 total = 0.0
                 for each in range(rows.shape[1]):
                     total += rows[sample, each, p] * rows[sample, each, q]
-                row[d - a + DEGREE, 0, e - b + DEGREE, f - c + DEGREE] += total
+                row[d - a + stencils.DEGREE, 0, e - b + stencils.DEGREE, f - c + stencils.DEGREE] += total
 
 
 MM_PER_M = 1000.0
@@ -139,13 +126,13 @@ class PressureField:
     reduced_chi2 : mean square of the samples' errors over that of the stated ones
     """
 
-    lattice: Lattice
+    lattice: stencils.Lattice
     coefficients: Floats
     missed: Floats
-    factor: Factor
+    factor: stencils.Factor
     mean: Floats
     wrong_share: float
-    expected: Expectation
+    expected: stencils.Expectation
     probability: Floats
     reduced_chi2: float
 
@@ -154,7 +141,7 @@ class PressureField:
         return self._of(self.coefficients, points_mm)
 
     def _of(self, coefficients: Floats, points_mm: Floats) -> Floats:
-        columns, values = rows_of(self.lattice, points_mm)
+        columns, values = stencils.rows_of(self.lattice, points_mm)
         flat = coefficients.ravel()
         return np.asarray(np.sum(values * flat[columns], axis=1) - self.mean @ flat)
 
@@ -167,7 +154,7 @@ class PressureField:
         found = np.empty(len(points_mm))
         for start in range(0, len(points_mm), POINTS_AT_ONCE):
             part = slice(start, start + POINTS_AT_ONCE)
-            columns, values = rows_of(self.lattice, points_mm[part])
+            columns, values = stencils.rows_of(self.lattice, points_mm[part])
             rows = np.tile(-self.mean, (len(columns), 1))
             rows[np.arange(len(columns))[:, np.newaxis], columns] += values
             found[part] = np.sum(rows.T * self.factor.solve(rows.T), axis=0)
@@ -229,7 +216,7 @@ def knots_for(points_mm: Floats) -> float:
 
 
 def pressure_field(
-    samples: Samples, lattice: Lattice, rng: np.random.Generator, wrong_share: float = 0.0
+    samples: Samples, lattice: stencils.Lattice, rng: np.random.Generator, wrong_share: float = 0.0
 ) -> PressureField:
     """Fit the pressure to its gradients.
 
@@ -239,7 +226,7 @@ def pressure_field(
     rng : draws the boxes that tell the penalties' weights
     wrong_share : of the accelerations that is wrong alike among neighbours, so that no fit lessens it
     """
-    expected = first_expectation(samples, lattice, (SECOND, THIRD), GradientBox)
+    expected = first_expectation(samples, lattice, (stencils.SECOND, stencils.THIRD), GradientBox)
     least = (LEAST_ERROR * expected.spread_mm) ** 2 * np.eye(3)
     samples = replace(samples, covariance_mm2=samples.covariance_mm2 + least)
     # The first probabilities are those to belong to a pressure of wide knots, which no single sample can bend.
@@ -280,21 +267,25 @@ def pressure_field(
     )
 
 
-def _coefficients(factor: Factor, lattice: Lattice, points_mm: Floats, weight: Floats, gradient: Floats) -> Floats:
+def _coefficients(
+    factor: stencils.Factor, lattice: stencils.Lattice, points_mm: Floats, weight: Floats, gradient: Floats
+) -> Floats:
     right = right_hand_side(lattice, points_mm, np.einsum("nij,nj->ni", weight, gradient))
     return factor.solve(right).reshape(lattice.shape)
 
 
 def _fitted(
-    samples: Samples, lattice: Lattice, expected: Expectation, covariance: Floats, probability: Floats
-) -> tuple[Factor, Floats, Floats, Floats]:
+    samples: Samples, lattice: stencils.Lattice, expected: stencils.Expectation, covariance: Floats, probability: Floats
+) -> tuple[stencils.Factor, Floats, Floats, Floats]:
     """Return the pressure of the least sum of squares and penalties.
 
     Factor, weights (n, 3, 3) of the samples, coefficients (nx, ny, nz) and errors (n, 3) of the samples.
     """
-    matrix = expected_inverse(lattice, replace(expected, spread_mm=lattice.smallest_mm * expected.spread_mm), 1)
+    matrix = stencils.expected_inverse(
+        lattice, replace(expected, spread_mm=lattice.smallest_mm * expected.spread_mm), 1
+    )
     weight = probability[:, np.newaxis, np.newaxis] * np.linalg.inv(covariance)
     add_gradients(matrix, lattice, samples.points_mm, weight)
-    factor = factorised(matrix)
+    factor = stencils.factorised(matrix)
     found = _coefficients(factor, lattice, samples.points_mm, weight, samples.value_mm)
     return factor, weight, found, samples.value_mm - gradient_at(samples.points_mm, lattice, found)

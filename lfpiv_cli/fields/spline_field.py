@@ -14,21 +14,6 @@ import numpy as np
 from lfpiv_cli.arrays import Floats
 from lfpiv_cli.fields import stencils
 from lfpiv_cli.fields.evidence import FREE_DIVERGENCE, divergence_weight, first_expectation, most_probable
-from lfpiv_cli.fields.stencils import (
-    DIVERGENCE,
-    SECOND,
-    SUPPORT,
-    THIRD,
-    Block,
-    Expectation,
-    Factor,
-    Lattice,
-    Stencil,
-    expected_inverse,
-    factorised,
-    gradient_rows,
-    rows_of,
-)
 from lfpiv_cli.fields.structure import Samples, belonging, error_covariance, squares, with_places
 
 # Knots are so many times the samples' mean distance apart: a third as many knots as samples. Among factors of 1.2 to
@@ -58,11 +43,11 @@ class SplineField:
     reduced_chi2 : mean square of the samples' errors over that of the stated ones
     """
 
-    lattice: Lattice
+    lattice: stencils.Lattice
     coefficients: Floats
-    covariance: tuple[list[Block], list[Block]]
+    covariance: tuple[list[stencils.Block], list[stencils.Block]]
     mean_mm: Floats
-    expected: Expectation
+    expected: stencils.Expectation
     probability: Floats
     reduced_chi2: float
 
@@ -101,7 +86,7 @@ class SplineField:
         return found + self.expected.unresolved_mm**2
 
     def _variance(self, points_mm: Floats) -> Floats:
-        columns, values = rows_of(self.lattice, points_mm)
+        columns, values = stencils.rows_of(self.lattice, points_mm)
         plane = int(np.prod(self.lattice.shape[1:]))
         planes, within = columns // plane, columns % plane
         diagonal, below = self.covariance
@@ -123,14 +108,14 @@ class SplineField:
         return found
 
 
-def lattice_for(samples: int, low_mm: Floats, high_mm: Floats) -> Lattice:
+def lattice_for(samples: int, low_mm: Floats, high_mm: Floats) -> stencils.Lattice:
     """Return the knots for so many samples in a box."""
     distance = float(np.prod(np.subtract(high_mm, low_mm)) / max(samples, 1)) ** (1.0 / 3.0)
-    return Lattice.affordable(low_mm, high_mm, KNOTS_OF_DISTANCE * distance)
+    return stencils.Lattice.affordable(low_mm, high_mm, KNOTS_OF_DISTANCE * distance)
 
 
 def spline_field(
-    samples: Samples, lattice: Lattice, divergence: str, rng: np.random.Generator, still_mm: Floats
+    samples: Samples, lattice: stencils.Lattice, divergence: str, rng: np.random.Generator, still_mm: Floats
 ) -> SplineField:
     """Fit a field.
 
@@ -144,7 +129,11 @@ def spline_field(
     """
     mean = np.median(samples.value_mm, axis=0) if not len(still_mm) else np.zeros(3)
     about = replace(samples, value_mm=samples.value_mm - mean)
-    penalties = (SECOND, THIRD) if divergence == "off" else (SECOND, THIRD, DIVERGENCE)
+    penalties = (
+        (stencils.SECOND, stencils.THIRD)
+        if divergence == "off"
+        else (stencils.SECOND, stencils.THIRD, stencils.DIVERGENCE)
+    )
     expected = first_expectation(about, lattice, penalties)
     # The gradients of a field of wide knots tell what errors of places add.
     wide = lattice.wide()
@@ -157,7 +146,7 @@ def spline_field(
     # With `by_others`, the covariance of the field at a sample that takes no part, one left out may return.
     expected, by_others = most_probable(about, lattice, expected, rng)
     if divergence == "free":
-        weights = {**expected.weights, DIVERGENCE: divergence_weight(expected, lattice, FREE_DIVERGENCE)}
+        weights = {**expected.weights, stencils.DIVERGENCE: divergence_weight(expected, lattice, FREE_DIVERGENCE)}
         expected = replace(expected, weights=weights)
     before, probability = _before(lattice, expected, still_mm), about.probability
     covariance = error_covariance(about, expected.scale, expected.unresolved_mm)
@@ -180,28 +169,28 @@ def spline_field(
 
 
 def _solved(
-    samples: Samples, lattice: Lattice, before: Stencil, covariance: Floats, probability: Floats
-) -> tuple[Factor, Floats]:
+    samples: Samples, lattice: stencils.Lattice, before: stencils.Stencil, covariance: Floats, probability: Floats
+) -> tuple[stencils.Factor, Floats]:
     """Return the factor of the normal equations and the coefficients (nx, 3, ny, nz)."""
     weight = probability[:, np.newaxis, np.newaxis] * np.linalg.inv(covariance)
     matrix = before.copy()
     stencils.add_samples(matrix, lattice, samples.points_mm, weight)
     weighted = np.einsum("nij,nj->ni", weight, samples.value_mm)
     right = stencils.right_hand_side(lattice, samples.points_mm, weighted)
-    factor = factorised(matrix)
+    factor = stencils.factorised(matrix)
     return factor, factor.solve(right.ravel()).reshape(right.shape)
 
 
-def _field_at(points_mm: Floats, lattice: Lattice, coefficients: Floats, along: int | None = None) -> Floats:
+def _field_at(points_mm: Floats, lattice: stencils.Lattice, coefficients: Floats, along: int | None = None) -> Floats:
     """Return the sum of splines (n, 3) at points, or its derivative along an axis."""
-    columns, values = rows_of(lattice, points_mm, along)
+    columns, values = stencils.rows_of(lattice, points_mm, along)
     by_component = coefficients.transpose(1, 0, 2, 3).reshape(3, -1)
     return np.stack([np.sum(values * part[columns], axis=1) for part in by_component], axis=1)
 
 
-def _before(lattice: Lattice, expected: Expectation, still_mm: Floats) -> Stencil:
+def _before(lattice: stencils.Lattice, expected: stencils.Expectation, still_mm: Floats) -> stencils.Stencil:
     """Return the inverse covariance of the field before any sample, 0 at points that are still."""
-    before = expected_inverse(lattice, expected)
+    before = stencils.expected_inverse(lattice, expected)
     if len(still_mm):
         weight = np.eye(3) / (STILL_SHARE * expected.spread_mm) ** 2
         stencils.add_samples(before, lattice, still_mm, np.broadcast_to(weight, (len(still_mm), 3, 3)))
@@ -217,14 +206,14 @@ COMPONENTS = 3
 
 def gradient_covariance_at(field: SplineField, points_mm: Floats) -> Floats:
     """Return the covariances (m, 9, 9) of a field's gradients at points, per mm^2 of squared displacements."""
-    columns, slopes = gradient_rows(field.lattice, points_mm)
+    columns, slopes = stencils.gradient_rows(field.lattice, points_mm)
     diagonal, below = field.covariance
     plane, length = int(np.prod(field.lattice.shape[1:])), len(diagonal[0])
     found = np.empty((len(points_mm), COMPONENTS, 3, COMPONENTS, 3))
     firsts = columns[:, 0] // plane
     for first in np.unique(firsts):
         # The covariance of the coefficients of four planes of x, which lie in one block or in two.
-        start, size = int(first) * COMPONENTS * plane, SUPPORT * COMPONENTS * plane
+        start, size = int(first) * COMPONENTS * plane, stencils.SUPPORT * COMPONENTS * plane
         block = start // length
         if start + size <= block * length + len(diagonal[block]):
             whole = diagonal[block]

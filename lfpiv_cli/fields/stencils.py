@@ -26,7 +26,6 @@ from lfpiv_cli.threads import share_out
 #
 # Axes: points (n, 3) in mm; knots are numbered along x, y, z.
 
-
 DEGREE = 3
 # Splines that are not zero within one cell, along one axis.
 SUPPORT = DEGREE + 1
@@ -279,7 +278,6 @@ def dense(matrix: Stencil) -> Floats:
 # spectrum k^-2 of turbulence nearly (k^-5/3), third ones that of smooth flows, k^-4; the weights say how much of each
 # there is.
 
-
 SECOND, THIRD, DIVERGENCE = "second", "third", "divergence"
 ORDERS = {SECOND: 2, THIRD: 3}
 # Constants and linear fields are not penalised by derivatives; they are expected up to ten times the samples' spread.
@@ -330,7 +328,6 @@ def expected_inverse(lattice: Lattice, expected: Expectation, components: int = 
 
 
 # Cholesky's factorisation of block tridiagonal matrices, and those blocks of the inverse that variances need.
-
 
 Block = Floats
 

@@ -87,7 +87,6 @@ def with_places(samples: Samples, gradient: Floats) -> Samples:
 
 # How far samples lie off a field, and with which probability each belongs to it.
 
-
 # Stated probabilities are not believed beyond these: a wrong link may look like a sure one, a doubtful one be right.
 LEAST_PROBABLE, MOST_PROBABLE = 0.3, 0.98
 
@@ -207,7 +206,6 @@ class VectorStructure:
 # sample.
 #
 # Axes: b places, k samples around each, nearest first; points and displacements in mm.
-
 
 # The unknown constant has so many times the variance of the samples.
 UNKNOWN_TIMES = 100.0

@@ -319,7 +319,6 @@ def _refine(pairs: Sequence[Pair], predictor: Floats, step: Pass, is_elongated: 
 # 0.75 for 240 x 200 x 160 with windows of 24 and 12 voxels; 1.63 for the first with windows of 16 and 8 and an
 # overlap of 0.75, of which 0.8 are the moments of the cells.
 
-
 # Two volumes, their splines, and both of them deformed, with what is made in between.
 VOXEL_BYTES = 34
 # Of each window and shift the products and their sum, the two maps, and twice the energies of two volumes.

@@ -201,7 +201,6 @@ def statistics_of(fields: Iterable[VectorField]) -> Statistics:
 # too small. Two measurements of one flow by different ways differ likewise by what their standard deviations let
 # expect.
 
-
 # Fewer places than this tell no ratio.
 FEWEST_PLACES = 20
 

@@ -23,7 +23,6 @@ from lfpiv_cli.threads import share_out
 #
 # Fields are (nz, ny, nx, 3) without NaN.
 
-
 # The end of a straight line fitted to the outer three values. Linear flows pass unchanged, and noise does not.
 LINE_END = np.array([5.0, 2.0, -1.0]) / 6.0
 # Six tenths of the end of a parabola fitted to the outer four, the rest of that line: it keeps most of the curvature of

@@ -24,7 +24,6 @@ from lfpiv_cli.threads import share_out
 # measured with an error of about -amplitude sin(2 pi f), the same in all windows at that depth, so that no scatter
 # shows it. It is stated as an uncertainty. Particles, which are fitted to the pixels behind each lens, do not lock.
 
-
 # Root mean square of the error in the focal plane over all fractions of a microlens, in microlenses.
 LOCKING_LENSES = 0.1
 

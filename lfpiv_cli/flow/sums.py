@@ -39,7 +39,6 @@ SMALLEST_ENERGY = 1e-9
 # What noise, ghosts and the tails of long particles leave in a region without tracers stays below.
 SMALLEST_AMPLITUDE = 0.07
 
-
 WindowWeights = tuple[Singles, Singles, Singles]
 
 

@@ -21,7 +21,6 @@ from lfpiv_cli.grid import Grid
 #
 # Axes: points and sides (x, y, z) in mm, arrays [z, y, x]. The kinds of `Walls` have the same methods.
 
-
 # Pipes that are tilted further from x or y are other pipes than `RoundWall` knows.
 LARGEST_TILT_DEG = 5.0
 
@@ -165,7 +164,6 @@ Triple = tuple[int, int, int]
 
 # A quotient of lengths that should be a whole number may fall short of it by this.
 ROUNDING = 1e-9
-
 
 # The standard deviation of a Gaussian weighting, in sizes of the window: at the middle of a face it is exp(-2). The
 # spread of its weights along an axis is 0.22 of the size, that of uniform ones 0.29.

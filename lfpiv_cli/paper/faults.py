@@ -198,7 +198,7 @@ def measured(fault: Fault, seed: int) -> Figures:
     tracers = replace(tracers, position_mm=np.column_stack([x, y, off]))
     moves = displacement(tracers.position_mm)
     first, second = (photograph(case.true, tracers.moved(sign * moves), READOUT, rng) for sign in (-0.5, 0.5))
-    search, signs = replace(case.search(), rounds=FEW_ROUNDS), np.array(fault.signs)
+    search, signs = replace(case, rounds=FEW_ROUNDS), np.array(fault.signs)
     found = [search.particles(image) * signs for image in fault.images((first, second))]
     middle, moved = tracks_between(found[0], found[1], case.believed)
     return place_and_velocity_figures(middle, moved, tracers.position_mm, moves)

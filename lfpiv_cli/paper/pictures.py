@@ -15,29 +15,16 @@ import numpy as np
 
 from lfpiv_cli.arrays import Flags, Floats, Singles
 from lfpiv_cli.grid import Grid
-from lfpiv_cli.pictures.style import (
-    BLUE,
-    DIVERGING,
-    GREEN,
-    ORANGE,
-    PURPLE,
-    SEQUENTIAL,
-    VERMILION,
-    Axes,
-    Figure,
-    new_figure,
-    new_panels,
-    styled,
-)
+from lfpiv_cli.pictures import style
 from lfpiv_cli.pictures.vectors import mean_of_known
 from lfpiv_cli.validation.flow import PAPER_SLICES, TOLERANCE, Duct, Measured, cumulative_distribution
 from lfpiv_cli.validation.methods import slice_at
 
 # Colours that people with any kind of colour vision tell apart; marks and lines differ as well, for print in grey.
 BOARD_STYLES: tuple[dict[str, Any], ...] = (
-    {"color": VERMILION, "marker": "s", "linestyle": "--"},
-    {"color": BLUE, "marker": "o", "linestyle": "-"},
-    {"color": GREEN, "marker": "^", "linestyle": "-."},
+    {"color": style.VERMILION, "marker": "s", "linestyle": "--"},
+    {"color": style.BLUE, "marker": "o", "linestyle": "-"},
+    {"color": style.GREEN, "marker": "^", "linestyle": "-."},
 )
 BAND = {"color": "#BBBBBB", "alpha": 0.5, "linewidth": 0.0}
 # Of a board in three dimensions voxels are shown that are brighter than this share of the brightest: 1/e, as for e_z.
@@ -65,21 +52,23 @@ def board_view(volume: Singles, grid: Grid) -> dict[str, Floats]:
     return {name: np.asarray(each, np.float64).round(DECIMALS) for name, each in view.items()}
 
 
-@styled
-def views_figure(views: Mapping[str, Mapping[str, Floats]]) -> Figure:
+@style.styled
+def views_figure(views: Mapping[str, Mapping[str, Floats]]) -> style.Figure:
     """Return boards in the focal plane, a row for each method: front, side and in three dimensions (Fig. 8)."""
-    figure = new_figure(11.0, 3.7 * len(views))
+    figure = style.new_figure(11.0, 3.7 * len(views))
     # as much of the depth for each as shows the longest dots and their surroundings
     reach = SHOWN_DEPTHS * max(float(np.abs(view["bright_mm"][:, 2]).max()) for view in views.values())
     for row, (label, view) in enumerate(views.items()):
         x, y, z = ((low, high) for low, high in view["bounds_mm"])
         front, side = (figure.add_subplot(len(views), 3, 3 * row + column) for column in (1, 2))
-        drawn = front.imshow(view["front"], origin="lower", extent=(*x, *y), cmap=SEQUENTIAL, vmin=0.0, vmax=1.0)
+        drawn = front.imshow(view["front"], origin="lower", extent=(*x, *y), cmap=style.SEQUENTIAL, vmin=0.0, vmax=1.0)
         front.set(title=f"{label}: maximum along z", xlabel="x (mm)", ylabel="y (mm)")
-        side.imshow(view["side"], origin="lower", extent=(*x, *z), cmap=SEQUENTIAL, vmin=0.0, vmax=1.0, aspect="auto")
+        side.imshow(
+            view["side"], origin="lower", extent=(*x, *z), cmap=style.SEQUENTIAL, vmin=0.0, vmax=1.0, aspect="auto"
+        )
         side.set(title=f"{label}: maximum along y", xlabel="x (mm)", ylabel="z (mm)", ylim=(-reach, reach))
         space: Any = figure.add_subplot(len(views), 3, 3 * row + 3, projection="3d")
-        look: dict[str, Any] = {"cmap": SEQUENTIAL, "s": 1.5, "linewidths": 0.0, "rasterized": True}
+        look: dict[str, Any] = {"cmap": style.SEQUENTIAL, "s": 1.5, "linewidths": 0.0, "rasterized": True}
         space.scatter(*view["bright_mm"].T, c=view["bright_mm"][:, 2], **look)
         space.set(title=f"{label}: brighter than 1/e", xlabel="x (mm)", ylabel="y (mm)", zlabel="z (mm)")
         space.set(zlim=(-reach, reach))
@@ -89,10 +78,10 @@ def views_figure(views: Mapping[str, Mapping[str, Floats]]) -> Figure:
     return figure
 
 
-@styled
+@style.styled
 def elongation_figure(
     methods: Mapping[str, Mapping[str, Any]], paper_mm: tuple[float, float], paper_sigma_mm: float
-) -> Figure:
+) -> style.Figure:
     """Return the elongation of dots and its spread by depth (Figs. 9 and 12).
 
     Parameters
@@ -101,13 +90,13 @@ def elongation_figure(
     paper_mm : lowest and highest elongation that the paper has
     paper_sigma_mm : what its spread stays below
     """
-    figure, (length, spread) = new_panels(10.0, 3.8, 1, 2)
+    figure, (length, spread) = style.new_panels(10.0, 3.8, 1, 2)
     length.axhspan(*paper_mm, label=f"paper: {paper_mm[0]:g} to {paper_mm[1]:g} mm", **BAND)
     spread.axhspan(0.0, paper_sigma_mm, label=f"paper: below {paper_sigma_mm:g} mm", **BAND)
-    for (label, figures), style in zip(methods.items(), BOARD_STYLES, strict=False):
+    for (label, figures), look in zip(methods.items(), BOARD_STYLES, strict=False):
         table = figures["by_depth"]
-        length.plot(table["depth_mm"], table["elongation_mm"], label=label, **style)
-        spread.plot(table["depth_mm"], table["elongation_sigma_mm"], label=label, **style)
+        length.plot(table["depth_mm"], table["elongation_mm"], label=label, **look)
+        spread.plot(table["depth_mm"], table["elongation_sigma_mm"], label=label, **look)
     length.set(title="mean over the dots", ylabel="elongation $e_z$ (mm)", ylim=(0.0, None))
     spread.set(title="standard deviation over the dots", ylabel=r"$\sigma$ (mm)", ylim=(0.0, None))
     _finish(length, spread)
@@ -116,10 +105,10 @@ def elongation_figure(
     return figure
 
 
-@styled
+@style.styled
 def location_figure(
     methods: Mapping[str, Mapping[str, Any]], spacing_mm: float, paper_steps_mm: tuple[float, float] | None
-) -> Figure:
+) -> style.Figure:
     """Return lateral and depth separations and their errors by depth (Figs. 11 and 13).
 
     Parameters
@@ -128,19 +117,19 @@ def location_figure(
     spacing_mm : x_g of Eq. 19
     paper_steps_mm : shortest and longest depth separation that the paper has, where it says
     """
-    figure, ((lateral, depth), (lateral_error, depth_error)) = new_panels(10.0, 6.6, 2, 2)
+    figure, ((lateral, depth), (lateral_error, depth_error)) = style.new_panels(10.0, 6.6, 2, 2)
     lateral.axhline(spacing_mm, color="black", linewidth=0.8, label="true")
     depth.axhline(1.0, color="black", linewidth=0.8, label="true")
     if paper_steps_mm is not None:
         depth.axhspan(*paper_steps_mm, label="paper: separations of {:g} to {:g} mm".format(*paper_steps_mm), **BAND)
-    for (label, figures), style in zip(methods.items(), BOARD_STYLES, strict=False):
+    for (label, figures), look in zip(methods.items(), BOARD_STYLES, strict=False):
         table = figures["by_depth"]
         at, spacing = np.array(table["depth_mm"]), np.array(table["spacing_mm"])
         middle, steps = 0.5 * (at[1:] + at[:-1]), np.diff(table["centre_mm"]) / np.diff(at)
-        lateral.plot(at, spacing, label=label, **style)
-        depth.plot(middle, steps, label=label, **style)
-        lateral_error.plot(at, 100.0 * np.abs(spacing - spacing_mm) / spacing_mm, label=label, **style)
-        depth_error.plot(middle, 100.0 * np.abs(steps - 1.0), label=label, **style)
+        lateral.plot(at, spacing, label=label, **look)
+        depth.plot(middle, steps, label=label, **look)
+        lateral_error.plot(at, 100.0 * np.abs(spacing - spacing_mm) / spacing_mm, label=label, **look)
+        depth_error.plot(middle, 100.0 * np.abs(steps - 1.0), label=label, **look)
     # a spacing that is right within a hundredth of a per cent is to look so
     reach = max(0.01 * spacing_mm, 1.2 * float(np.abs(np.subtract(lateral.get_ylim(), spacing_mm)).max()))
     lateral.set(title="lateral spacing", ylabel="mm", ylim=(spacing_mm - reach, spacing_mm + reach))
@@ -153,15 +142,15 @@ def location_figure(
     return figure
 
 
-@styled
-def centres_figure(centres_mm: Mapping[str, Floats]) -> Figure:
+@style.styled
+def centres_figure(centres_mm: Mapping[str, Floats]) -> style.Figure:
     """Return the centres of all dots of all boards, (n, 3) for each method, coloured by depth (Fig. 10)."""
-    figure = new_figure(5.2 * len(centres_mm) + 0.8, 4.2)
+    figure = style.new_figure(5.2 * len(centres_mm) + 0.8, 4.2)
     deepest = max(float(np.abs(each[:, 2]).max()) for each in centres_mm.values())
     for number, (label, each) in enumerate(centres_mm.items(), start=1):
         space: Any = figure.add_subplot(1, len(centres_mm), number, projection="3d")
         # depth along the page, as the boards were moved
-        look: dict[str, Any] = {"cmap": SEQUENTIAL, "vmin": -deepest, "vmax": deepest, "s": 6.0}
+        look: dict[str, Any] = {"cmap": style.SEQUENTIAL, "vmin": -deepest, "vmax": deepest, "s": 6.0}
         drawn = space.scatter(each[:, 2], each[:, 0], each[:, 1], c=each[:, 2], **look)
         space.set(title=label, xlabel="z (mm)", ylabel="x (mm)", zlabel="y (mm)")
         space.set_box_aspect((2.0, 1.0, 1.0), zoom=1.1)
@@ -170,7 +159,7 @@ def centres_figure(centres_mm: Mapping[str, Floats]) -> Figure:
     return figure
 
 
-def _finish(*panels: Axes) -> None:
+def _finish(*panels: style.Axes) -> None:
     for panel in panels:
         panel.set_xlabel("z (mm)")
         panel.grid(alpha=0.3)
@@ -183,17 +172,17 @@ def _tidy(space: Any) -> None:
 
 
 # Colours that the colour-blind tell apart; in print markers do.
-WAY_STYLES = ((VERMILION, "s", "--"), (BLUE, "o", "-."), (GREEN, "^", "-"), (PURPLE, "v", ":"))
+WAY_STYLES = ((style.VERMILION, "s", "--"), (style.BLUE, "o", "-."), (style.GREEN, "^", "-"), (style.PURPLE, "v", ":"))
 
 
-@styled
-def slice_maps_figure(methods: Mapping[str, Measured], duct: Duct) -> Figure:
+@style.styled
+def slice_maps_figure(methods: Mapping[str, Measured], duct: Duct) -> style.Figure:
     """Return the size of the velocity in the six slices (columns), true and by each way (rows), on one scale."""
     first = next(iter(methods.values()))
     rows = {"true": (first, first.truth)} | {name: (m, m.field.velocity) for name, m in methods.items()}
     highest = max(float(np.linalg.norm(m.truth[m.inside], axis=-1).max()) for m in methods.values())
-    figure, axes = new_panels(13.0, 2.3 * len(rows) + 0.6, len(rows), 6, squeeze=False, sharey=True)
-    look: dict[str, Any] = {"vmin": 0.0, "vmax": highest, "cmap": SEQUENTIAL, "aspect": "auto"}
+    figure, axes = style.new_panels(13.0, 2.3 * len(rows) + 0.6, len(rows), 6, squeeze=False, sharey=True)
+    look: dict[str, Any] = {"vmin": 0.0, "vmax": highest, "cmap": style.SEQUENTIAL, "aspect": "auto"}
     for row, (name, (measured, velocity)) in zip(axes, rows.items(), strict=True):
         low, high = measured.field.grid.bounds_mm(0)
         speed = np.where(measured.inside, np.linalg.norm(velocity, axis=-1), np.nan)
@@ -210,10 +199,10 @@ def slice_maps_figure(methods: Mapping[str, Measured], duct: Duct) -> Figure:
     return figure
 
 
-@styled
-def cumulative_figure(methods: Mapping[str, Measured]) -> Figure:
+@style.styled
+def cumulative_figure(methods: Mapping[str, Measured]) -> style.Figure:
     """Return the share of vectors over their relative error, along the flow and of the whole vector, with the 25 %."""
-    figure, panels = new_panels(10.0, 4.2, 1, 2, sharey=True)
+    figure, panels = style.new_panels(10.0, 4.2, 1, 2, sharey=True)
     for (name, m), (colour, _, line) in zip(methods.items(), WAY_STYLES, strict=False):
         shares = cumulative_distribution(m.pairs)
         errors = 100.0 * np.array(shares["relative_error"])
@@ -236,13 +225,13 @@ def _as_shares(places_mm: Floats, duct: Duct, axis: int) -> Floats:
 
 # The paper sees velocities that are too small beyond this share of the channel's width.
 PAPERS_WALL = 0.8
-CASE_STYLES = ((BLUE, "o"), (VERMILION, "s"), (GREEN, "^"), (PURPLE, "v"), (ORANGE, "D"))
+CASE_STYLES = ((style.BLUE, "o"), (style.VERMILION, "s"), (style.GREEN, "^"), (style.PURPLE, "v"), (style.ORANGE, "D"))
 
 
-@styled
-def raw_figure(image: Singles, mask: Flags) -> Figure:
+@style.styled
+def raw_figure(image: Singles, mask: Flags) -> style.Figure:
     """Return a part of a raw image with bubbles, alone and with the outline of what a mask leaves out."""
-    figure, panels = new_panels(10.0, 10.0 * 0.5 * image.shape[0] / image.shape[1] + 1.0, 1, 2)
+    figure, panels = style.new_panels(10.0, 10.0 * 0.5 * image.shape[0] / image.shape[1] + 1.0, 1, 2)
     highest = float(np.percentile(image[~mask], 99.9)) if not mask.all() else float(image.max())
     for axes, title in zip(panels, ("raw image", "left out by the mask"), strict=True):
         shown = axes.imshow(np.sqrt(np.clip(image, 0.0, highest)), cmap="gray", vmin=0.0, interpolation="nearest")
@@ -254,20 +243,27 @@ def raw_figure(image: Singles, mask: Flags) -> Figure:
     return figure
 
 
-@styled
-def plane_figure(methods: Mapping[str, Measured], duct: Duct, plane: int) -> Figure:
+@style.styled
+def plane_figure(methods: Mapping[str, Measured], duct: Duct, plane: int) -> style.Figure:
     """Return vectors and the error of the velocity along the flow in one x-y plane of windows, by way to measure."""
     axis = duct.across["x/D"]
     highest = float(next(iter(methods.values())).truth[..., 0].max())
-    figure, axes = new_panels(3.2 * len(methods) + 1.0, 8.2, 2, len(methods), squeeze=False, sharex=True, sharey=True)
+    figure, axes = style.new_panels(
+        3.2 * len(methods) + 1.0, 8.2, 2, len(methods), squeeze=False, sharex=True, sharey=True
+    )
     for column, (name, m) in zip(axes.T, methods.items(), strict=True):
         along, across = np.meshgrid(*(m.field.grid.axis_mm(k) for k in (0, axis)))
         shares = _as_shares(across, duct, axis)
         u, v = m.field.velocity[plane][..., 0], m.field.velocity[plane][..., axis]
-        look: dict[str, Any] = {"cmap": SEQUENTIAL, "clim": (0.0, highest), "scale": 12.0 * highest, "width": 0.008}
+        look: dict[str, Any] = {
+            "cmap": style.SEQUENTIAL,
+            "clim": (0.0, highest),
+            "scale": 12.0 * highest,
+            "width": 0.008,
+        }
         arrows = column[0].quiver(along, shares, u, v, u, **look)
         error, reach = u - m.truth[plane][..., 0], 0.5 * highest
-        image = column[1].pcolormesh(along, shares, error, cmap=DIVERGING, vmin=-reach, vmax=reach)
+        image = column[1].pcolormesh(along, shares, error, cmap=style.DIVERGING, vmin=-reach, vmax=reach)
         column[0].set(title=name)
         column[1].set(xlabel="x, along the flow (mm)")
         for panel in column:
@@ -279,10 +275,10 @@ def plane_figure(methods: Mapping[str, Measured], duct: Duct, plane: int) -> Fig
     return figure
 
 
-@styled
-def wall_profile_figure(methods: Mapping[str, Measured], duct: Duct) -> Figure:
+@style.styled
+def wall_profile_figure(methods: Mapping[str, Measured], duct: Duct) -> style.Figure:
     """Return the mean over flow and depth of the velocity along the flow, over x/D, and its error beside it."""
-    figure, (left, right) = new_panels(10.0, 4.2, 1, 2)
+    figure, (left, right) = style.new_panels(10.0, 4.2, 1, 2)
     axis = duct.across["x/D"]
     first = next(iter(methods.values()))
     true = _mean_over(first.truth[..., 0], first.inside, axis)

@@ -24,7 +24,6 @@ MARKS, DASHES = ("o", "s", "^", "D", "v"), ("-", "--", "-.", ":", (0, (5, 1, 1, 
 # Names of so many curves find room among them.
 ROOM = 3
 
-
 # Tracers crowd where fewer than this share is found.
 SEEN_SHARE = 0.9
 # Letters of a line above a panel.

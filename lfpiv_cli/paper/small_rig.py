@@ -123,30 +123,6 @@ def photograph(rig: Rig, tracers: Tracers, readout: Readout, rng: np.random.Gene
     return recorded.astype(np.float32) - np.float32(readout.dark_level_counts)
 
 
-@dataclass(frozen=True, eq=False)
-class Search:
-    """A rig as it is believed to be, and the box (x, y, z) around the middle of its channel in which is measured."""
-
-    rig: Rig
-    size_mm: tuple[float, float, float]
-    search_voxel_mm: tuple[float, float, float] = SEARCH_VOXEL_MM
-    rounds: tuple[Round, ...] = ROUNDS
-
-    @cached_property
-    def _weights(self) -> Weights:
-        camera, media = self.rig.camera, self.rig.media
-        grid = self.rig.grid(self.size_mm, self.search_voxel_mm)
-        padding = default_padding(camera, media, grid)
-        return Weights(grid, padding, factorise(camera, media, grid.padded(padding)), camera.column_axis)
-
-    def particles(self, image: Image) -> Points:
-        """Return the places (n, 3) of the particles behind an image, those a little outside the box as well."""
-        rig, weights = self.rig, self._weights
-        view = raw_view(rig.camera, rig.media, 0.5 * DIAMETER_MM, None, rig.space)
-        found = find_particles(task_of(image, view, weights, rig.camera, normalisers(weights.padded)), self.rounds)
-        return rig.reference.points_from_focal_point(found.position_mm)
-
-
 def sheet(f_number: float = F_NUMBER) -> Camera:
     """Return the camera of the data sheet; the microlenses follow the f-number, so that lens images touch."""
     aperture = FOCAL_LENGTH_MM / f_number
@@ -155,18 +131,39 @@ def sheet(f_number: float = F_NUMBER) -> Camera:
     return Camera(-1.0, FOCAL_LENGTH_MM, aperture, distance, distance, lattice, PIXEL_MM, SENSOR_PX, SENSOR_PX)
 
 
+# Where tracers that stand apart are sought: somewhat wider than they stand.
+WIDTH_MM, DEPTH_MM = 2.0 * (HALF_WIDTH_MM + MARGIN_MM), 2.0 * HALF_DEPTH_MM + 1.0
+
+
 @dataclass(frozen=True, eq=False)
 class Case:
-    """A rig as it is and as it is believed to be, and how deep around the middle of the channel is looked."""
+    """A rig as it is and as it is believed to be, by which particles are sought.
+
+    Attributes
+    ----------
+    size_mm : of the box (x, y, z) around the middle of the believed channel in which is looked
+    voxel_mm : in which particles are sought before they are fitted
+    """
 
     true: Rig
     believed: Rig
-    search_depth_mm: float = 2.0 * HALF_DEPTH_MM + 1.0
+    size_mm: tuple[float, float, float] = (WIDTH_MM, WIDTH_MM, DEPTH_MM)
+    voxel_mm: tuple[float, float, float] = SEARCH_VOXEL_MM
+    rounds: tuple[Round, ...] = ROUNDS
 
-    def search(self) -> Search:
-        """Return the search of what is believed, somewhat wider than tracers stand."""
-        width = 2.0 * (HALF_WIDTH_MM + MARGIN_MM)
-        return Search(self.believed, (width, width, self.search_depth_mm))
+    @cached_property
+    def _weights(self) -> Weights:
+        camera, media = self.believed.camera, self.believed.media
+        grid = self.believed.grid(self.size_mm, self.voxel_mm)
+        padding = default_padding(camera, media, grid)
+        return Weights(grid, padding, factorise(camera, media, grid.padded(padding)), camera.column_axis)
+
+    def particles(self, image: Image) -> Points:
+        """Return the places (n, 3) of the particles behind an image, those a little outside the box as well."""
+        rig, weights = self.believed, self._weights
+        view = raw_view(rig.camera, rig.media, 0.5 * DIAMETER_MM, None, rig.space)
+        found = find_particles(task_of(image, view, weights, rig.camera, normalisers(weights.padded)), self.rounds)
+        return rig.reference.points_from_focal_point(found.position_mm)
 
 
 def aimed(believed: Rig) -> Case:
@@ -195,7 +192,8 @@ def focus_wrong(by_mm: float) -> Case:
     real = refocused(camera, -focal / (distance - focal))
     believed = camera.with_micro_images(real.micro_image_lattice_px())
     deeper = abs(by_mm) * WATER.fluid / WATER.air
-    return Case(Rig(real, board_z_mm=by_mm), Rig(believed), 2.0 * (HALF_DEPTH_MM + deeper))
+    depth = 2.0 * (HALF_DEPTH_MM + deeper)
+    return Case(Rig(real, board_z_mm=by_mm), Rig(believed), (WIDTH_MM, WIDTH_MM, depth))
 
 
 def lattice_shifted(by_px: float) -> Case:
@@ -222,9 +220,9 @@ def strewn_apart(rng: np.random.Generator, depth_mm: tuple[float, float] = (-HAL
 def place_figures(case: Case, tracers: Tracers, rng: np.random.Generator, readout: Readout = READOUT) -> Figures:
     """Return the figures of the map from true to measured places, and the shares of tracers found and of those true.
 
-    The map is NaN where too few are found to know it. The search is somewhat wider than tracers stand.
+    The map is NaN where too few are found to know it.
     """
-    return judged(case.search().particles(photograph(case.true, tracers, readout, rng)), tracers)
+    return judged(case.particles(photograph(case.true, tracers, readout, rng)), tracers)
 
 
 def judged(found: Points, tracers: Tracers) -> Figures:
@@ -266,7 +264,7 @@ def at_f_number(f_number: float, seed: int) -> Figures:
     image = photograph(exact, tracers, READOUT, rng)
     figures: Figures = {}
     for name, seen in (("exact", exact), ("paraxial", replace(exact, refraction="paraxial"))):
-        places = judged(Case(exact, seen).search().particles(image), tracers)
+        places = judged(Case(exact, seen).particles(image), tracers)
         figures |= {f"{name}_{figure}": value for figure, value in places.items()}
     return figures
 
@@ -304,7 +302,7 @@ def at_depth(distance_mm: float, seed: int) -> Figures:
     known = Rig(sheet(), WATER, WIDE_CHANNEL)
     tracers = strewn_apart(rng, (max(distance_mm - BAND_MM, 0.0), distance_mm + BAND_MM))
     tracers.position_mm[:, 2] *= rng.choice([-1.0, 1.0], len(tracers.position_mm))
-    found = Case(known, known, 22.0).search().particles(photograph(known, tracers, READOUT, rng))
+    found = Case(known, known, (WIDTH_MM, WIDTH_MM, 22.0)).particles(photograph(known, tracers, READOUT, rng))
     pairs = match(found, tracers.position_mm, PITCH_MM)
     error_mm = pairs.error_voxel * PITCH_MM if len(pairs.found) else np.full((1, 3), np.nan)
     spread, rms = MAD_TO_SIGMA * np.median(np.abs(error_mm), axis=0), np.sqrt(np.mean(error_mm**2, axis=0))
@@ -320,7 +318,7 @@ def crowded(per_lens: float, seed: int) -> Figures:
     pair = [tracers.moved(sign * 0.5 * displacement(tracers.position_mm)) for sign in (-1.0, 1.0)]
     images = [photograph(known, each, READOUT, rng) for each in pair]
     seen = SENSOR_PX * PIXEL_MM
-    search = Search(known, (seen, seen, CROWD_DEPTH_MM), search_voxel_mm=CROWD_VOXEL_MM)
+    search = Case(known, known, (seen, seen, CROWD_DEPTH_MM), CROWD_VOXEL_MM)
     found = [search.particles(image) for image in images]
     inner = np.array([HALF_WIDTH_MM, HALF_WIDTH_MM, 0.5 * CROWD_DEPTH_MM])
     places = particle_figures(found[0], pair[0].position_mm, -inner, inner, PITCH_MM)

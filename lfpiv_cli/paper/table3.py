@@ -94,7 +94,6 @@ REDUCED = " Reduced: fewer boards and dots, a smaller sensor and volume, fewer i
 # Dots next to the focal plane have uneven depth profiles.
 NEAR_MM = 2.0
 
-
 QUANTITIES = {
     "elongation_mm": ("elongation e_z (mm)", 1.0),
     "elongation_sigma_mm": ("spread of the elongation, sigma (mm)", 1.0),

@@ -147,7 +147,6 @@ SHOWN = {
     "particles": "particles",
 }
 
-
 # What the program does at its best.
 BEST = "fits the tracers themselves to both images and follows them"
 

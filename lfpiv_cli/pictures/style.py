@@ -22,7 +22,6 @@ if TYPE_CHECKING:
 else:
     Axes = Figure = Any
 
-
 P = ParamSpec("P")
 R = TypeVar("R")
 

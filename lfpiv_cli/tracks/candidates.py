@@ -23,7 +23,6 @@ from lfpiv_cli.arrays import Flags, Floats, Integers
 # worse: its variance is one number for all, for light that changes, and another one times the variance that the fits
 # state, which near the focal plane and among neighbours is a thousand times that of others.
 
-
 # Of the histogram of logarithms of ratios, and how many classes of stated errors it has.
 RATIO_BINS, CLASSES = 4001, 16
 # Widths from which the peak is sought, and how often it is improved.
@@ -247,7 +246,6 @@ def candidates_of(first: Seen, second: Seen, middle_mm: Floats, reach_mm: Floats
 
 
 # Which particles of a sequence belong together, and where the tracks so made have been.
-
 
 NO_TRACK = NO_PARTICLE = -1
 

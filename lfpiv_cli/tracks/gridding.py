@@ -33,7 +33,6 @@ from lfpiv_cli.threads import blocks, in_threads
 # no distance are taken from the displacements themselves; the best linear combination of neighbours about a linear
 # trend, and the variance of what it misses, follow. Each component is for itself, distances alike in all directions.
 
-
 # Neighbours whose differences show the structure function, and that let expect a displacement.
 PAIRED, USED = 12, 16
 # Distances are sorted into so many groups at most, of so many pairs at least.
@@ -170,7 +169,6 @@ def without_own(near: Integers, own: Integers) -> Integers:
 # its noise, and that of the difference of two fits, follow from the tracks' stated errors.
 #
 # Axes: m places, k tracks around each, nearest first; points and displacements in mm.
-
 
 # The furthest track of a fit still counts for a quarter: a Gaussian whose deviation is this share of the radius.
 KERNEL_WIDTH = 0.6

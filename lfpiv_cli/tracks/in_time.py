@@ -29,7 +29,6 @@ from lfpiv_cli.tracks.candidates import NO_TRACK, Seen, Trajectories
 # among neighbours, noise is not: a fit to many tracks lessens noise alone, so that derivatives are drawn to zero less
 # than would be best for one track.
 
-
 # 1, t, t^2/2, t^3/6, t^4/24; the first three are whatever the places say.
 QUARTIC, FREE_OF_QUARTIC = 5, 3
 SECOND = 2

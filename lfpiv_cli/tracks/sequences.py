@@ -292,7 +292,6 @@ def _bridges(
 # places of its track, and one whose track begins or ends beside it lies on the way on. As a Kalman smoother does
 # after its filter, what comes later now counts as what came before.
 
-
 # Frames on either side that are looked at: a cubic has a place or more to spare.
 REACH_FRAMES = 3
 

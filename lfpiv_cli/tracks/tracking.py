@@ -31,7 +31,6 @@ from lfpiv_cli.tracks.gridding import kriged, structure_of
 # less: how far neighbours' displacements differ is not known at first, so likenesses of several widths count
 # together.
 
-
 NEIGHBOURS = 14
 # Standard deviations of the differences between neighbours' displacements, laterally, in microlenses in the scene.
 WIDTHS_LENSES = (0.4, 0.8, 1.6)
@@ -113,7 +112,6 @@ def _support(
 # After Williams and Lau, *Approximate evaluation of marginal association probabilities with belief propagation*, IEEE
 # Trans. Aerosp. Electron. Syst. 50 (2014): messages between the particles of two frames along the pairs that are
 # possible, exact where these form no loops and near it where they do.
-
 
 # Messages settle in some ten rounds; a change of this size is none.
 MOST_ROUNDS = 200
