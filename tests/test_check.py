@@ -39,8 +39,9 @@ from lfpiv_cli.validation.planning import (
 )
 from lfpiv_cli.validation.volume import pairs_of
 from lfpiv_cli.verbs.check import Pictures, image_lines, lattice_of
+from lfpiv_cli.verbs.checks import Line, worst
 from lfpiv_cli.verbs.particles import light_of
-from lfpiv_cli.verbs.planning import Line, bench_of, diffraction_line, rig_figures, rig_lines, windows_line, worst
+from lfpiv_cli.verbs.planning import bench_of, diffraction_line, rig_figures, rig_lines, windows_line
 
 WATER = Media(1.0, 1.49, 1.33)
 Tree = dict[str, Any]

@@ -166,7 +166,7 @@ def test_signals_end_the_work_and_leave_nothing(tmp_path, sent, code, said):
 A_BROKEN_LIBRARY = """
 import signal, sys
 from lfpiv_cli.cli import main
-from lfpiv_cli.verbs import chain
+from lfpiv_cli.verbs import run
 
 def broken(*_, **__):
     try:
@@ -174,7 +174,7 @@ def broken(*_, **__):
     except BaseException:
         raise RuntimeError("no compiled object yet")
 
-chain.warm_up = broken
+run.warm_up = broken
 sys.argv = ["lfpiv", "warm-up"]
 main()
 """

@@ -18,7 +18,7 @@ from lfpiv_cli.paper.parts import Work
 from lfpiv_cli.paper.table4 import FULL, QUICK, TINY
 from lfpiv_cli.validation.flow import PAPER_OVERALL, PAPER_SLICES, Duct, Measured
 from lfpiv_cli.validation.methods import profile_at, slice_at
-from lfpiv_cli.verbs.chain import board_depths
+from lfpiv_cli.verbs.simulate import board_depths
 
 DUCT = Duct(4.0, (0.0, 0.0, 0.0), "x", 0.1082)
 GRID = Grid.centred((4, 10, 10), (0.4, 0.4, 0.4), (0.0, 0.0, 0.0))

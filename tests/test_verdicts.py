@@ -13,11 +13,12 @@ from lfpiv_cli.flow.field import MASKED, REJECTED
 from lfpiv_cli.verbs.checks import (
     FOR_INFORMATION,
     WORTHLESS,
-    Reason,
+    Line,
     of_two_ways,
     of_vectors,
     of_warnings,
-    verdicts,
+    worst,
+    worst_first,
 )
 from tests.vector_fields import SHAPE, SIGMA_VOXEL, VOXEL_MM, field_of, noise_mm, rotation_mm
 
@@ -32,8 +33,8 @@ def made(command: str, *codes: str) -> dict[str, Any]:
     return {"command": command, "warnings": warnings}
 
 
-def words(reasons: list[Reason]) -> dict[str, str]:
-    return {each.part: each.word for each in verdicts(reasons, ("calibration", "images", "vectors"))}
+def words(lines: list[Line]) -> dict[str, str]:
+    return {part: worst(worst_first(lines, part), "good") for part in ("calibration", "images", "vectors")}
 
 
 def test_codes_are_those_that_are_documented() -> None:
@@ -52,20 +53,20 @@ def test_a_warning_counts_for_the_part_that_its_command_makes() -> None:
 
 def test_what_is_said_for_information_speaks_against_nothing() -> None:
     found = of_warnings({"a.vtkhdf": made("reconstruct", "particle-diameter-limit")})
-    assert [(each.part, each.word) for each in found] == [("images", "good")]
+    assert [(each.about, each.verdict) for each in found] == [("images", "good")]
 
 
 def test_a_warning_of_a_whole_batch_is_told_once_with_its_count() -> None:
     records = {f"{number}.vtkhdf": made("reconstruct", "frame-saturated") for number in range(5)}
     [reason] = of_warnings(records)
-    assert "(and 4 more)" in reason.text
-    assert "mend it" in reason.text
+    assert "(and 4 more)" in reason.reason
+    assert "mend it" in reason.reason
 
 
 def test_the_worst_reason_comes_first() -> None:
-    reasons = [Reason("images", "good", "fine"), Reason("images", "no", "dark"), Reason("images", "look", "dim")]
-    [found] = verdicts(reasons, ("images",))
-    assert (found.word, found.reasons) == ("no", ("dark", "dim", "fine"))
+    lines = [Line("images", "good", "fine"), Line("images", "no", "dark"), Line("images", "look", "dim")]
+    assert [each.reason for each in worst_first(lines, "images")] == ["dark", "dim", "fine"]
+    assert (worst(lines), worst([])) == ("no", "unknown")
 
 
 def test_vectors_as_good_as_they_state() -> None:
@@ -81,16 +82,16 @@ def test_errors_larger_than_stated_are_to_be_looked_at(understated: float) -> No
 
 def test_displacements_within_their_errors_are_to_be_looked_at() -> None:
     [_, reason] = of_vectors(field_of(noise_mm(0), SIGMA_VOXEL), "v")
-    assert reason.word == "look"
-    assert "standard deviations of zero" in reason.text
+    assert reason.verdict == "look"
+    assert "standard deviations of zero" in reason.reason
 
 
 def test_a_component_that_is_hardly_known_is_named() -> None:
     flow = np.zeros((*SHAPE, 3))
     flow[..., 0] = 1.0
     reasons = of_vectors(field_of(flow, np.array([0.05, 0.02, 1.2])), "v")
-    [reason] = [each for each in reasons if each.word == "look"]
-    assert "w is known to 0.36 mm, 36% of the usual displacement" in reason.text
+    [reason] = [each for each in reasons if each.verdict == "look"]
+    assert "w is known to 0.36 mm, 36% of the usual displacement" in reason.reason
     assert words(of_vectors(field_of(flow, SIGMA_VOXEL), "v"))["vectors"] == "good"
 
 
@@ -106,6 +107,6 @@ def test_two_ways_that_contradict_each_other() -> None:
     one = field_of(rotation_mm() + noise_mm(1), SIGMA_VOXEL)
     same = field_of(rotation_mm() + noise_mm(2), SIGMA_VOXEL)
     off = field_of(rotation_mm() + noise_mm(3) + 8.0 * SIGMA_VOXEL * VOXEL_MM, SIGMA_VOXEL)
-    assert of_two_ways(one, same, ("a", "b"))[0].word == "good"
-    assert of_two_ways(one, off, ("a", "b"))[0].word == "look"
+    assert of_two_ways(one, same, ("a", "b"))[0].verdict == "good"
+    assert of_two_ways(one, off, ("a", "b"))[0].verdict == "look"
     assert not of_two_ways(one, field_of(np.zeros((*SHAPE, 3)), None), ("a", "b"))

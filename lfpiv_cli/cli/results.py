@@ -228,6 +228,6 @@ def warm_up(overwrite: bool, console: Console, cache: Path | None = None) -> dic
 
     if cache is not None:
         kernel_cache.use(cache)
-    from lfpiv_cli.verbs import chain as stage
+    from lfpiv_cli.verbs import run as stage
 
     return stage.warm_up(console=console)

@@ -17,9 +17,8 @@ from lfpiv_cli.paper.parts import AS_PAPER, BOARD, MISALIGNED, Drawing, Findings
 from lfpiv_cli.paper.pictures import cumulative_figure, slice_maps_figure
 from lfpiv_cli.validation.flow import Duct, Measured
 from lfpiv_cli.validation.methods import slices_figure
-from lfpiv_cli.verbs.chain import board_depths, measure_images, simulate_images
-from lfpiv_cli.verbs.simulate import simulate_boards
-from lfpiv_cli.verbs.validate import duct_of, measured_of
+from lfpiv_cli.verbs.simulate import board_depths, simulate_boards, simulate_images
+from lfpiv_cli.verbs.validate import duct_of, measure_images, measured_of
 
 # The paper's laminar channel flow (Section 4.2) as sections of a config, at the sizes that the report has.
 

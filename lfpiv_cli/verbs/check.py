@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -29,11 +29,9 @@ from lfpiv_cli.reconstruction.images import FULL_SCALES, Mask, defects, light, s
 from lfpiv_cli.validation import planning
 from lfpiv_cli.validation.planning import share_beyond
 from lfpiv_cli.verbs.calibrate import NO_BOARD, calibration_notices, calibration_of, photographs
-from lfpiv_cli.verbs.checks import word_of
+from lfpiv_cli.verbs.checks import Line, Verdict, word_of, worst
 from lfpiv_cli.verbs.planning import (
     Bench,
-    Line,
-    Verdict,
     bench_of,
     by_depth,
     by_which_light,
@@ -42,7 +40,6 @@ from lfpiv_cli.verbs.planning import (
     rig_figures,
     rig_lines,
     seeding_line,
-    worst,
 )
 from lfpiv_cli.weights.build import aligned, default_padding
 
@@ -358,4 +355,4 @@ def check(
         from lfpiv_cli.pictures.calibration import planning_figure
 
         write_picture(options.picture, planning_figure(by_depth(bench), bench.bounds_mm), overwrite)
-    return {"verdicts": [line.row() for line in lines], **figures, "verdict": worst(lines)}
+    return {"verdicts": [asdict(line) for line in lines], **figures, "verdict": worst(lines)}

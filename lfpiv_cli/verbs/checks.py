@@ -282,11 +282,10 @@ def still_notices(tracks: PointRows, name: str) -> list[Notice]:
     return [Notice("frames-alike", name, text, remedy, moved, f"above {STILL_SIGMAS:g} standard errors")]
 
 
-Word = Literal["good", "look", "no"]
+Verdict = Literal["unknown", "good", "look", "no"]
+# From the best to the worst; what is not known counts for nothing.
+ORDER: tuple[Verdict, ...] = ("unknown", "good", "look", "no")
 Part = Literal["calibration", "images", "vectors"]
-# From the best to the worst.
-WORDS: tuple[Word, ...] = ("good", "look", "no")
-PARTS: tuple[Part, ...] = ("calibration", "images", "vectors")
 
 # What makes a result worthless, and what is said for information.
 WORTHLESS = {
@@ -319,35 +318,25 @@ LARGEST_SHARE = 0.25
 
 
 @dataclass(frozen=True)
-class Verdict:
-    """What is thought of a part: the worst of its reasons' words."""
+class Line:
+    """One thing that speaks for or against something: what it is about, the verdict, and why."""
 
-    part: Part
-    word: Word
-    reasons: tuple[str, ...]
-
-
-@dataclass(frozen=True)
-class Reason:
-    """One thing that speaks for or against a part."""
-
-    part: Part
-    word: Word
-    text: str
+    about: str
+    verdict: Verdict
+    reason: str
 
 
-def verdicts(reasons: Iterable[Reason], made: Iterable[Part]) -> list[Verdict]:
-    """Return the verdict of each part that was made, its worst reasons first."""
-    by_part = {part: [each for each in reasons if each.part == part] for part in PARTS}
-    found = []
-    for part in made:
-        worst_first = sorted(by_part[part], key=lambda each: -WORDS.index(each.word))
-        word = worst_first[0].word if worst_first else "good"
-        found.append(Verdict(part, word, tuple(each.text for each in worst_first)))
-    return found
+def worst(lines: Iterable[Line], unsaid: Verdict = "unknown") -> Verdict:
+    """Return the verdict on the whole; `unsaid` where there are no lines."""
+    return max((line.verdict for line in lines), key=ORDER.index, default=unsaid)
 
 
-def of_warnings(records: Mapping[str, Mapping[str, Any]]) -> list[Reason]:
+def worst_first(lines: Iterable[Line], about: str) -> list[Line]:
+    """Return the lines about something, the worst first."""
+    return sorted((each for each in lines if each.about == about), key=lambda each: -ORDER.index(each.verdict))
+
+
+def of_warnings(records: Mapping[str, Mapping[str, Any]]) -> list[Line]:
     """Return what the warnings say that the records of files hold, by the files' names; each once, with its count."""
     seen: dict[tuple[Part, str], list[tuple[str, Mapping[str, Any]]]] = {}
     for name, made in records.items():
@@ -359,8 +348,8 @@ def of_warnings(records: Mapping[str, Mapping[str, Any]]) -> list[Reason]:
     for (part, _), those in seen.items():
         first, files = those[0][1], len({name for name, _ in those})
         more = f" (and {files - 1} more)" if files > 1 else ""
-        word = max((word_of(warning) for _, warning in those), key=WORDS.index)
-        reasons.append(Reason(part, word, f"{first['about']}: {first['text']}{more}; {first['remedy']}"))
+        word = max((word_of(warning) for _, warning in those), key=ORDER.index)
+        reasons.append(Line(part, word, f"{first['about']}: {first['text']}{more}; {first['remedy']}"))
     return reasons
 
 
@@ -369,7 +358,7 @@ def verb_of(made: Mapping[str, Any]) -> str:
     return str(made.get("command")).split(" ")[0]
 
 
-def word_of(warning: Mapping[str, Any]) -> Word:
+def word_of(warning: Mapping[str, Any]) -> Verdict:
     """Return what is thought of a result by one warning's record alone."""
     code, measured = warning["code"], warning.get("measured")
     if code in WORTHLESS or (code in WORTHLESS_BEYOND and measured is not None and measured > WORTHLESS_BEYOND[code]):
@@ -377,18 +366,18 @@ def word_of(warning: Mapping[str, Any]) -> Word:
     return "good" if code in FOR_INFORMATION else "look"
 
 
-def of_vectors(field: VectorField, name: str) -> list[Reason]:
+def of_vectors(field: VectorField, name: str) -> list[Line]:
     """Return what a field says of itself."""
     used, there = field.flag < MASKED, field.flag < REJECTED
     if not there.any():
-        return [Reason("vectors", "no", f"{name}: no vector is left")]
+        return [Line("vectors", "no", f"{name}: no vector is left")]
     share = np.count_nonzero(there) / np.count_nonzero(used)
-    reasons = [Reason("vectors", "good", f"{name}: {np.count_nonzero(there)} vectors, {share:.0%} of the places")]
+    reasons = [Line("vectors", "good", f"{name}: {np.count_nonzero(there)} vectors, {share:.0%} of the places")]
     if field.uncertainty_voxel is not None:
         long = np.abs(field.displacement_voxel[there]) > SHORTEST_SIGMAS * field.uncertainty_voxel[there]
         if np.mean(long.any(axis=1)) < 0.5:
             text = f"{name}: most displacements are within {SHORTEST_SIGMAS:g} standard deviations of zero"
-            reasons.append(Reason("vectors", "look", f"{text}; a longer time between the images would show the flow"))
+            reasons.append(Line("vectors", "look", f"{text}; a longer time between the images would show the flow"))
         else:
             # Components that are known too badly to tell much of the flow.
             usual_mm = float(np.median(np.linalg.norm(field.displacement_voxel[there] * field.voxel_mm, axis=1)))
@@ -401,21 +390,21 @@ def of_vectors(field: VectorField, name: str) -> list[Reason]:
                         f"{name}: {component} is known to {written(sigma, 2)} mm, {sigma / usual_mm:.0%} of the usual "
                         "displacement; particles in place of volumes, or a longer time between the images, tell more"
                     )
-                    reasons.append(Reason("vectors", "look", text))
+                    reasons.append(Line("vectors", "look", text))
     ratio = divergence_over_stated(field)
     if ratio is not None and ratio > LARGEST_OVER_STATED:
         text = f"{name}: the divergence is {ratio:.1f} times what the stated errors make, and a liquid has none"
         reasons.append(
-            Reason("vectors", "look", f"{text}: errors are larger than stated, or the flow finer than windows")
+            Line("vectors", "look", f"{text}: errors are larger than stated, or the flow finer than windows")
         )
     return reasons
 
 
-def of_two_ways(one: VectorField, other: VectorField, names: tuple[str, str]) -> list[Reason]:
+def of_two_ways(one: VectorField, other: VectorField, names: tuple[str, str]) -> list[Line]:
     """Return what two measurements of one flow say of each other."""
     ratios = difference_over_stated(one, other)
     if ratios is None:
         return []
     told = ", ".join(f"{ratio:.1f}" for ratio in ratios)
     text = f"{names[0]} and {names[1]} differ by {told} (u, v, w) times what their stated errors let expect"
-    return [Reason("vectors", "look" if max(ratios) > LARGEST_OVER_STATED else "good", text)]
+    return [Line("vectors", "look" if max(ratios) > LARGEST_OVER_STATED else "good", text)]

@@ -220,7 +220,7 @@ def fields_of(found: TracksOf[Any], name: str) -> Iterator[FittedField]:
     if isinstance(found.points, Points) and "displacement_mm" in found.points.arrays:
         yield fitted([samples_of_tracks(found.points)], found.settings, "penalised", name)
         return
-    for path in found.paths:
+    for path in found.paths():
         covariance = path.sigma_mm[:, :, np.newaxis] ** 2 * np.eye(3)
         sure = np.ones(len(path.middle_mm))
         samples = Samples(path.middle_mm, path.displacement_mm, covariance, sure, place_share=0.0)

@@ -9,7 +9,7 @@ import contextlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,15 +32,11 @@ from lfpiv_cli.synthetic.render import Readout
 from lfpiv_cli.validation import planning
 from lfpiv_cli.validation.planning import Miniature, Tracer
 from lfpiv_cli.verbs.build_weights import ray_source
-from lfpiv_cli.verbs.checks import WORDS, Word
+from lfpiv_cli.verbs.checks import Line, Verdict
 from lfpiv_cli.verbs.particles import light_of
 from lfpiv_cli.verbs.weights_cost import TRACER_S, Cost, check_rig, cost_notices, cost_of, rig_notices
 from lfpiv_cli.weights.build import default_padding
 from lfpiv_cli.weights.scene import Source
-
-Verdict = Word | Literal["unknown"]
-# From the best to the worst; what is not known counts for nothing.
-ORDER: tuple[Verdict, ...] = ("unknown", *WORDS)
 
 # Shares of the volume: in full view, and within the depth of field.
 GOOD_VIEW, LEAST_VIEW = 0.97, 0.5
@@ -66,19 +62,6 @@ FARTHEST_FIELDS = 2.0
 FLOW_POINTS, FAST_PERCENTILE = 9, 95.0
 # Bytes of a raw image's pixel, and of a volume's voxel.
 PIXEL_BYTES, VOXEL_BYTES = 2, 4
-
-
-@dataclass(frozen=True)
-class Line:
-    """A verdict: what it is about, and why."""
-
-    about: str
-    verdict: Verdict
-    reason: str
-
-    def row(self) -> dict[str, str]:
-        """Return it as plain data."""
-        return {"about": self.about, "verdict": self.verdict, "reason": self.reason}
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,11 +182,6 @@ def rig_lines(bench: Bench) -> list[Line]:
         _cost,
     )
     return [question(bench) for question in questions]
-
-
-def worst(lines: Sequence[Line]) -> Verdict:
-    """Return the verdict on the whole."""
-    return max((line.verdict for line in lines), key=ORDER.index, default="unknown")
 
 
 def rig_figures(bench: Bench) -> dict[str, Any]:

@@ -146,15 +146,16 @@ def report(
         ("images", not made_by.isdisjoint(checks.OF_IMAGES), "no volumes and no particles"),
         ("vectors", bool(contents.of("vectors") or contents.of("tracks")), "no vectors and no tracks"),
     ]
-    reasons += [checks.Reason(part, "look", text) for part, there, text in counted if not there]
-    judged = checks.verdicts(reasons, [part for part, _, _ in counted])
-    words = {each.part: each.word for each in judged}
+    reasons += [checks.Line(part, "look", text) for part, there, text in counted if not there]
+    judged = {part: checks.worst_first(reasons, part) for part, _, _ in counted}
+    words = {part: checks.worst(lines, "good") for part, lines in judged.items()}
     advice = "Nothing speaks against these vectors, as far as images and vectors tell it themselves."
     if "no" in words.values():
         advice = "Do not use these vectors before what is said below is mended."
     elif "look" in words.values():
         advice = "Look at what is said below before you use these vectors."
-    rows = tuple((each.part, each.word, "; ".join(each.reasons) or "nothing speaks against it") for each in judged)
+    told = {part: "; ".join(each.reason for each in lines) for part, lines in judged.items()}
+    rows = tuple((part, words[part], told[part] or "nothing speaks against it") for part in judged)
     verdict = Table("Verdict: good, look (at the reasons), or no", ("part", "verdict", "reasons"), rows)
     with TemporaryDirectory() as pictures:
         drawer = Drawer(contents, Path(pictures), {sha256(path): path for path in options.raw})
@@ -233,7 +234,7 @@ class Drawer:
         return Picture(target, caption)
 
 
-def _of_all_vectors(contents: Contents, fields: Fields) -> list[checks.Reason]:
+def _of_all_vectors(contents: Contents, fields: Fields) -> list[checks.Line]:
     """Return what vectors say of themselves and of each other.
 
     What speaks against vectors that better ones by another command stand beside is told, and not counted.
@@ -241,15 +242,15 @@ def _of_all_vectors(contents: Contents, fields: Fields) -> list[checks.Reason]:
     by_command: dict[str, list[Path]] = {}
     for path in fields:
         by_command.setdefault(checks.verb_of(contents.record(path)), []).append(path)
-    reasons: list[checks.Reason] = []
+    reasons: list[checks.Line] = []
     for number, paths in enumerate(by_command.values()):
         found = [each for path in paths for each in checks.of_vectors(fields[path], path.name)]
-        against = [each for each in found if each.word != "good"]
-        reasons += [replace(each, word="good") if number else each for each in against[:MOST_FIELDS]]
+        against = [each for each in found if each.verdict != "good"]
+        reasons += [replace(each, verdict="good") if number else each for each in against[:MOST_FIELDS]]
         if len(against) > MOST_FIELDS:
             text = f"{len(against) - MOST_FIELDS} more reasons like these in other files"
-            reasons.append(checks.Reason("vectors", "good" if number else "look", text))
-        reasons += [each for each in found if each.word == "good"][:1]
+            reasons.append(checks.Line("vectors", "good" if number else "look", text))
+        reasons += [each for each in found if each.verdict == "good"][:1]
     if all(len(paths) == 1 for paths in by_command.values()):
         for one, other in combinations(fields, 2):
             reasons += checks.of_two_ways(fields[one], fields[other], (one.name, other.name))

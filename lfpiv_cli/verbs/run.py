@@ -15,6 +15,7 @@ import contextlib
 import hashlib
 import math
 import shutil
+import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
@@ -24,7 +25,7 @@ from typing import Any, cast
 from lfpiv_cli.console import CONSOLE, Console
 from lfpiv_cli.errors import ConfigError, InputError, LfpivError, OutputExistsError, PartialError, UsageError
 from lfpiv_cli.files import images as image_files
-from lfpiv_cli.files.atomic import ensure_writable
+from lfpiv_cli.files.atomic import ensure_writable, write_text
 from lfpiv_cli.files.batch import Frame, frames_of, output_paths, pending
 from lfpiv_cli.files.calibration_file import read_calibration
 from lfpiv_cli.files.config import Config, load_config
@@ -44,7 +45,6 @@ from lfpiv_cli.verbs.follow import SEQUENCE_IS_WHOLE, follow_particles
 from lfpiv_cli.verbs.following import SHORTEST, ensure_sequence
 from lfpiv_cli.verbs.frames import mask_of, other_frames, read_frame, reader
 from lfpiv_cli.verbs.pairs import image_pairs
-from lfpiv_cli.verbs.particles import Prepared
 from lfpiv_cli.verbs.report import ReportOptions, report
 from lfpiv_cli.verbs.run_steps import (
     CALIBRATION,
@@ -58,6 +58,7 @@ from lfpiv_cli.verbs.run_steps import (
     Vectors,
     earlier_run,
 )
+from lfpiv_cli.verbs.simulate import frame_names, simulate_board, simulate_particles, simulate_white
 from lfpiv_cli.verbs.weights_cost import FLOAT_BYTES, Cost, cost_of, ensure_volume_fits
 
 REPORT = "report.html"
@@ -93,33 +94,25 @@ def run(
     settings = load_config(config)
     frames, pairs = _ensure_possible(settings, options)
     console.warn(pairs.settled(options.keep_going))
-    prepared = Prepared()
     steps = Steps(output, console, earlier_run(output, overwrite), options.deadline(), options.shard == ALL)
-    chain = Chain(config, options, frames, pairs, steps, prepared, overwrite)
-
-    def choose(weights: Path) -> Choice:
-        return _chosen(settings, options, lambda: _counted(settings, chain, weights))
-
-    def methods(weights: Path) -> tuple[FlowMethod, ...]:
-        return choose(weights).methods
-
+    chain = Chain(config, settings, options, frames, pairs, steps, overwrite)
     if not options.dry_run:
         ensure_volume_fits(settings, options.method in ("volumes", "both"))
     try:
-        return planned(settings, chain, methods) if options.dry_run else _made(chain, choose, overwrite)
+        return planned(chain) if options.dry_run else _made(chain)
     except OutputExistsError as error:
-        replacing = Chain(config, options, frames, pairs, steps, prepared, overwrite=True)
-        raise OutputExistsError(f"{error}{with_overwrite(settings, replacing, methods)}") from error
+        chain.overwrite = True
+        raise OutputExistsError(f"{error}{with_overwrite(chain)}") from error
 
 
-def _made(chain: Chain, choose: Callable[[Path], Choice], overwrite: bool) -> dict[str, Any]:
+def _made(chain: Chain) -> dict[str, Any]:
     """Take all steps; return what is told of them (PartialError: something failed)."""
     steps, options, output = chain.steps, chain.options, chain.steps.output
     ensure_writable(output / RECORD, overwrite=True)
     weights = chain.weights()
     if not chain.share:
         return steps.summary()
-    choice = choose(weights)
+    choice = _chosen(chain.settings, options, lambda: _counted(chain, weights))
     steps.console.say(f"by {' and '.join(choice.methods)}: {choice.reason}")
     steps.told.update(choice.told())
     fields: dict[str, Vectors] = {method: chain.vectors_by(method, weights) for method in choice.methods}
@@ -141,7 +134,7 @@ def _made(chain: Chain, choose: Callable[[Path], Choice], overwrite: bool) -> di
             # Of all that the folder holds, where a step has made anything.
             if is_kept:
                 return {}
-            replacing = overwrite or bool(steps.earlier)
+            replacing = chain.overwrite or bool(steps.earlier)
             return report(output, page, ReportOptions(raw=raw), overwrite=replacing, console=steps.console)
 
         told |= {"verdict": steps.take("report", [page], make).get("verdict"), "report": str(page)}
@@ -264,9 +257,9 @@ def _chosen(settings: Config, options: RunOptions, count_tracers: Callable[[], f
     return Choice((asked,), f"as asked for; but there are {reason}", count)
 
 
-def _counted(settings: Config, chain: Chain, weights: Path) -> float | None:
+def _counted(chain: Chain, weights: Path) -> float | None:
     """Return how many tracers for each microlens the first image holds, as the run before has counted if it could."""
-    options, frames, steps = chain.options, chain.frames, chain.steps
+    settings, options, frames, steps = chain.settings, chain.options, chain.frames, chain.steps
     shape, level = settings.image_shape(), options.level
     first = _first_readable(frames, shape, options.keep_going)
     files = (weights, frames[first].path, *filter(None, (options.dark, level.path)))
@@ -285,18 +278,14 @@ def _counted(settings: Config, chain: Chain, weights: Path) -> float | None:
     return particles.tracers_per_lens(bench, particles.frame_of(bench, *read(first)))
 
 
-def planned(settings: Config, chain: Chain, choose: Callable[[Path], Sequence[FlowMethod]]) -> dict[str, Any]:
+def planned(chain: Chain) -> dict[str, Any]:
     """Return what a run would make, and what that takes; write nothing.
-
-    Parameters
-    ----------
-    choose : tells by which methods the flow will be measured, by the weights
 
     Raises
     ------
     LfpivError : the run would not begin; as where calibration or weights are there, and were made from something else
     """
-    output, options, console = chain.steps.output, chain.options, chain.steps.console
+    settings, output, options, console = chain.settings, chain.steps.output, chain.options, chain.steps.console
     targets = {
         "calibrate-snapshot": calibrate.target_of(chain.config, output / CALIBRATION, chain.photographs),
         "build-weights": build_weights.target_of(chain.config, output / WEIGHTS, chain.made_with),
@@ -308,9 +297,9 @@ def planned(settings: Config, chain: Chain, choose: Callable[[Path], Sequence[Fl
             before.append(name)
     counts = {"frames": len(chain.order), "pairs": len(chain.share), "steps_to_make": before}
     if before:
-        return counts | _from_nothing(settings, chain)
+        return counts | _from_nothing(chain)
     weights, to_come = output / WEIGHTS, _weights_to_come(chain)
-    methods = choose(weights)
+    methods = _chosen(settings, options, lambda: _counted(chain, weights)).methods
     told: dict[str, dict[str, Any]] = {}
     for method in methods:
         if options.follow:
@@ -329,10 +318,10 @@ def planned(settings: Config, chain: Chain, choose: Callable[[Path], Sequence[Fl
     return counts | {"method": " and ".join(methods)} | _together(told, output)
 
 
-def with_overwrite(settings: Config, chain: Chain, choose: Callable[[Path], Sequence[FlowMethod]]) -> str:
+def with_overwrite(chain: Chain) -> str:
     """Return in words what a run that may overwrite makes again and what it keeps; nothing where that is not known."""
     try:
-        told = planned(settings, chain, choose)
+        told = planned(chain)
     except LfpivError:
         return ""
     before = {"calibrate-snapshot": CALIBRATION, "build-weights": WEIGHTS}
@@ -364,9 +353,10 @@ def _weights_to_come(chain: Chain) -> Gone | None:
     return None if without_warnings(carried_record(weights)) == made else Gone(sha256(weights), made)
 
 
-def _from_nothing(settings: Config, chain: Chain) -> dict[str, Any]:
+def _from_nothing(chain: Chain) -> dict[str, Any]:
     """Return what is made where there are no weights yet."""
-    options, grid, console = chain.options, settings.grid(), chain.steps.console
+    settings, options, console = chain.settings, chain.options, chain.steps.console
+    grid = settings.grid()
     good = [k for k in chain.order if chain.frames[k].fault is None]
     whole = [number for number in chain.share if set(chain.pairs.pairs[number]) <= set(good)]
     asked = "particles" if options.follow and options.method == "auto" else options.method
@@ -427,3 +417,54 @@ def _together(told: Mapping[str, Mapping[str, Any]], output: Path) -> dict[str, 
 def _words(key: str, told: Sequence[Mapping[str, Any]]) -> str | None:
     """Return all the ways in which a figure is known."""
     return "; ".join(dict.fromkeys(each[key] for each in told if each[key])) or None
+
+
+# Warming up is a small experiment, in which every step is taken once, so that all kernels are compiled.
+
+# A corner of the paper's sensor and a thin channel, as small as every step still works on.
+RIG = """\
+camera:
+  main_lens:   {magnification: -1.0, focal_length_mm: 100.0, aperture_mm: 25.0}
+  microlenses: {focal_length_mm: 0.8, pitch_mm: 0.1, layout: square}
+  sensor:      {pixel_um: 5.5, columns: 450, rows: 448, microlens_distance_mm: 0.8, column_axis: x}
+media:   {air: 1.0, window: 1.49, fluid: 1.33}
+channel: {width_mm: 3.0, wall_mm: 2.0}
+board:   {dots: [4, 4], spacing_mm: 0.5, dot_diameter_mm: 0.15, thickness_mm: 0.0}
+volume:  {shape_xyz: [20, 20, 28], voxel_mm: 0.1, centre_mm: [0, 0, 0], reference: mid_plane}
+reconstruction: {solver: em, iterations: 4}
+correlation:    {windows: [16, 10], overlap: 0.5, dt_s: 0.002}
+simulation:
+  flow: {kind: shear, along: x, across: z, rate_per_s: 30.0, velocity_m_s: [0.12, 0.0, 0.0]}
+  particles: 80
+  particle_diameter_mm: 0.05
+  frames: 4
+  board_z_mm: 2.2
+  distortion_per_mm2: 2.0e-5
+  seed: 3
+"""
+WARM_UP_STEPS = 3
+
+
+def warm_up(*, console: Console = CONSOLE) -> dict[str, Any]:
+    """Compile all kernels into numba's folder, by simulating a small experiment and measuring it each way."""
+    quiet = Console(quiet=True)
+    with tempfile.TemporaryDirectory() as name, console.progress(WARM_UP_STEPS, "warm-up") as advance:
+        folder = Path(name)
+        config = folder / "rig.yaml"
+        write_text(config, RIG, overwrite=False)
+        for simulate in (simulate_white, simulate_board, simulate_particles):
+            simulate(config, folder, console=quiet)
+        advance(1)
+        images = [folder / frame for frame in frame_names(load_config(config).simulation.frames)]
+        recording = RunOptions(
+            images=images[:2],
+            white=(folder / "white.tif",),
+            dark=folder / "dark.tif",
+            board=(folder / "board.tif",),
+            report=False,
+        )
+        run(config, folder / "pair", replace(recording, method="both", combine=True), console=quiet)
+        advance(1)
+        run(config, folder / "sequence", replace(recording, images=images, follow=True), console=quiet)
+        advance(1)
+    return {"steps": WARM_UP_STEPS}

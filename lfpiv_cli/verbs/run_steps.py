@@ -17,6 +17,7 @@ from lfpiv_cli.console import Console
 from lfpiv_cli.errors import InputError, LfpivError, OutputExistsError, PartialError, StoppedEarlyError
 from lfpiv_cli.files.atomic import write_json
 from lfpiv_cli.files.batch import VTKHDF_SUFFIX, Frame, Target
+from lfpiv_cli.files.config import Config
 from lfpiv_cli.files.pairing import Pairs
 from lfpiv_cli.files.provenance import Gone, bear_alike, carried_record, sha256
 from lfpiv_cli.files.shares import Deadline, awaited
@@ -218,15 +219,15 @@ class Chain:
     def __init__(
         self,
         config: Path,
+        settings: Config,
         options: RunOptions,
         frames: Sequence[Frame],
         pairs: Pairs,
         steps: Steps,
-        prepared: Prepared,
         overwrite: bool,
     ) -> None:
         """Take the frames and which of them belong together, and what steps share."""
-        self.config, self.options, self.frames, self.steps = config, options, frames, steps
+        self.config, self.settings, self.options, self.frames, self.steps = config, settings, options, frames, steps
         shard = options.shard
         self.share = shard.of(range(len(pairs.pairs)))
         ours = [pairs.pairs[number] for number in self.share]
@@ -234,13 +235,13 @@ class Chain:
         self.order = list(dict.fromkeys([*(k for pair in ours for k in pair), *(alone if shard.is_last else [])]))
         # Of several shards the first one tells them.
         self.failures = failures_of(pairs) if shard.number == 1 else []
-        self.prepared, self._overwrite = prepared, overwrite
+        self.prepared, self.overwrite = Prepared(), overwrite
         self.pairs = replace(pairs, left_out=())
 
     @property
     def common(self) -> dict[str, Any]:
         """What every stage is given."""
-        return {"overwrite": self._overwrite, "console": self.steps.console}
+        return {"overwrite": self.overwrite, "console": self.steps.console}
 
     @property
     def _resuming(self) -> dict[str, Any]:
@@ -265,17 +266,18 @@ class Chain:
     def weights(self) -> Path:
         """Calibrate and build the weights, or take those of another worker, shard or run; return their file."""
         calibration, weights, picture = (self.steps.output / name for name in (CALIBRATION, WEIGHTS, PICTURE))
-        photographs, made_with = self.photographs, self.made_with
-        self.steps.take(
-            "calibrate-snapshot",
-            [calibration, picture],
-            _alone(calibration, lambda: calibrate_snapshot(self.config, calibration, photographs, **self.common)),
-        )
-        self.steps.take(
-            "build-weights",
-            [weights],
-            _alone(weights, lambda: build_weights_file(self.config, weights, made_with, **self.common)),
-        )
+
+        def calibrated() -> dict[str, Any]:
+            with awaited(calibration):
+                return calibrate_snapshot(self.config, calibration, self.photographs, **self.common)
+
+        def built() -> dict[str, Any]:
+            with awaited(weights):
+                return build_weights_file(self.config, weights, self.made_with, **self.common)
+
+        # What another worker makes now is waited for, and what it has made is kept.
+        self.steps.take("calibrate-snapshot", [calibration, picture], calibrated)
+        self.steps.take("build-weights", [weights], built)
         return weights
 
     def combined(self, first: Vectors, second: Vectors) -> Vectors:
@@ -298,7 +300,7 @@ class Chain:
         by_particles, kept = method == "particles", self.options.keep == "all" or not self.pairs.separate
         chosen = replace(PARTICLES, residual=kept) if by_particles else VOLUMES
         options = replace(chosen, **self._of_images, **self._resuming)
-        given = (weights, self.options.images, self.steps.output / method, options, self._overwrite)
+        given = (weights, self.options.images, self.steps.output / method, options, self.overwrite)
         return Reconstruction(*given, self.pairs if by_particles else None, self.prepared, self.order, to_come)
 
     def vectors_by(self, method: FlowMethod, weights: Path) -> Vectors:
@@ -329,8 +331,8 @@ class Chain:
         """Return the batch of pairs of volumes, or of particles."""
         dt_s, resuming = self.options.dt_s, self._resuming
         if method == "volumes":
-            return Correlation(files, output, CorrelateOptions(dt_s=dt_s, **resuming), self._overwrite, pairs, gone)
-        return Tracks(files, output, TrackOptions(dt_s=dt_s, grid=True, **resuming), self._overwrite, pairs, gone)
+            return Correlation(files, output, CorrelateOptions(dt_s=dt_s, **resuming), self.overwrite, pairs, gone)
+        return Tracks(files, output, TrackOptions(dt_s=dt_s, grid=True, **resuming), self.overwrite, pairs, gone)
 
     def _worked(self, batch: Correlation | Tracks | Reconstruction) -> dict[str, Any]:
         """Work through a batch of which nothing fails; return what is told of it."""
@@ -431,13 +433,3 @@ class Chain:
             return [self.steps.output / f"{name}{VTKHDF_SUFFIX}"]
         of_frames = self._of_frames(name)
         return [of_frames[first] for first, _ in self.pairs.pairs]
-
-
-def _alone(output: Path, make: Callable[[], dict[str, Any]]) -> Callable[[], dict[str, Any]]:
-    """Return what makes an output after any other worker that makes it now: what that one has made is kept."""
-
-    def make_alone() -> dict[str, Any]:
-        with awaited(output):
-            return make()
-
-    return make_alone

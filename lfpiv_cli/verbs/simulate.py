@@ -246,6 +246,31 @@ def ensure_experiment(settings: Config) -> None:
     settings.grid(reference)
 
 
+# Boards over the depth of the volume: cubic polynomials need four, a fifth tells how well they fit. They leave this
+# share of the depth free at both ends: there may be walls, and boards are tilted.
+DLFC_BOARDS = 5
+DLFC_MARGIN = 0.05
+
+
+def simulate_images(config: Path, images: Path, *, overwrite: bool = False, console: Console = CONSOLE) -> None:
+    """Simulate all images of the config's experiment, boards at several depths where its weights need them."""
+    settings = load_config(config)
+    common: dict[str, Any] = {"overwrite": overwrite, "console": console}
+    simulate_white(config, images, **common)
+    simulate_particles(config, images, **common)
+    if settings.weights.method == "dlfc":
+        simulate_boards(config, images, board_depths(settings), **common)
+    else:
+        simulate_board(config, images, **common)
+
+
+def board_depths(settings: Config) -> list[float]:
+    """Return the depths of the boards that rays are fitted to, from the origin of the volume's coordinates."""
+    low, high = settings.grid().bounds_mm(2)
+    margin = DLFC_MARGIN * (high - low)
+    return [float(depth) for depth in np.linspace(low + margin, high - margin, DLFC_BOARDS).round(2)]
+
+
 # What can be simulated, by the name that the command has for it.
 SCENES = {"white": simulate_white, "board": simulate_board, "particles": simulate_particles}
 

@@ -31,7 +31,6 @@ from lfpiv_cli.verbs.fields import fields_of
 from lfpiv_cli.verbs.frames import dt_notices
 from lfpiv_cli.verbs.pairs import PairBatch, PairBatchOptions, doubts
 from lfpiv_cli.verbs.tracks import (
-    Lazy,
     Tracking,
     TracksOf,
     ensure_frames,
@@ -47,23 +46,32 @@ from lfpiv_cli.verbs.tracks import (
 KEPT_FRAMES = 2 * max(HALVES_FRAMES) + 1
 
 
-class SeenFrames(Lazy[Seen]):
+class SeenFrames(Sequence[Seen]):
     """The particles of a sequence's frames, read when they are asked for; the last few stay in memory."""
 
     def __init__(self, count: int, read: Callable[[int], particle_file.Points]) -> None:
         """Take how many frames there are, and what reads one."""
-        super().__init__(count, lru_cache(KEPT_FRAMES)(self._seen))
-        self._read = read
-        self._counts: dict[int, int] = {}
+        self._read, self._seen = read, lru_cache(KEPT_FRAMES)(self._seen_in)
+        self._counts: dict[int, int] = dict.fromkeys(range(count), -1)
 
-    def _seen(self, number: int) -> Seen:
+    def __len__(self) -> int:
+        """Return how many frames there are."""
+        return len(self._counts)
+
+    def __getitem__(self, number: int) -> Seen:  # type: ignore[override]
+        """Return the particles of a frame."""
+        if number not in self._counts:
+            raise IndexError(number)
+        return self._seen(number)
+
+    def _seen_in(self, number: int) -> Seen:
         found = seen_in(self._read(number))
         self._counts[number] = len(found)
         return found
 
     def particles(self, number: int) -> int:
         """Return how many particles a frame has."""
-        return self._counts[number] if number in self._counts else len(self[number])
+        return self._counts[number] if self._counts[number] >= 0 else len(self[number])
 
 
 @contextmanager

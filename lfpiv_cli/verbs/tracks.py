@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any, Generic, TypeVar, overload
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,32 +26,6 @@ from lfpiv_cli.tracks.sequences import SHORTEST, follow, scatter_in, states_at
 from lfpiv_cli.tracks.tracking import SEARCH_LENSES, wrong_link_variance
 from lfpiv_cli.tracks.tracking import track as match
 from lfpiv_cli.verbs.checks import few_notices
-
-Item = TypeVar("Item")
-
-
-class Lazy(Sequence[Item]):
-    """Items that are made when they are asked for."""
-
-    def __init__(self, count: int, make: Callable[[int], Item]) -> None:
-        """Take how many there are, and what makes one."""
-        self._places, self._make = range(count), make
-
-    def __len__(self) -> int:
-        """Return how many there are."""
-        return len(self._places)
-
-    @overload
-    def __getitem__(self, number: int) -> Item: ...
-
-    @overload
-    def __getitem__(self, number: slice) -> list[Item]: ...
-
-    def __getitem__(self, number: int | slice) -> Item | list[Item]:
-        """Return one, or some of them."""
-        if isinstance(number, slice):
-            return [self._make(place) for place in self._places[number]]
-        return self._make(self._places[number])
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,15 +80,11 @@ class SequenceTracks:
                 arrays[name][rows] = array
         return arrays
 
-    @property
-    def paths(self) -> Sequence[Paths]:
-        """The tracks that pass from each frame to the next, those of one interval computed at a time."""
-        return Lazy(len(self.frames) - 1, self._path)
-
-    def _path(self, number: int) -> Paths:
-        """Return the tracks that pass from a frame to the next, half-way between the two."""
-        state = states_at(self.found, self.frames, number + 0.5, self.scatter, self.half_frames)[1]
-        return Paths(state.position_mm, state.velocity, state.velocity_sigma)
+    def paths(self) -> Iterator[Paths]:
+        """Yield the tracks that pass from each frame to the next, half-way between the two."""
+        for number in range(len(self.frames) - 1):
+            state = states_at(self.found, self.frames, number + 0.5, self.scatter, self.half_frames)[1]
+            yield Paths(state.position_mm, state.velocity, state.velocity_sigma)
 
     def summary(self) -> dict[str, Any]:
         """Return counts and figures, units in their names."""
@@ -213,14 +183,14 @@ class TracksOf(Generic[Rows]):
     ----------
     points : one for each link of two frames, or for each place of a track in a sequence
     format_name : of the file that holds such points
-    paths : tracks that pass from each frame to the next
+    paths : yields the tracks that pass from each frame to the next
     summary : counts and figures, units in their names
     settings : the resolved config
     """
 
     points: Rows
     format_name: str
-    paths: Sequence[Paths]
+    paths: Callable[[], Iterator[Paths]]
     summary: dict[str, Any]
     settings: Config
 
@@ -232,7 +202,7 @@ class TracksOf(Generic[Rows]):
         """Yield what `vectors` returns, one at a time."""
         settings = self.settings
         windows = windows_of(settings, settings.masking_walls())
-        return (vectors_from_paths(paths, windows, settings.correlation.dt_s) for paths in self.paths)
+        return (vectors_from_paths(paths, windows, settings.correlation.dt_s) for paths in self.paths())
 
 
 class Tracked(TracksOf[Points]):
@@ -343,7 +313,7 @@ def tracked(
         "expected_wrong_links": float(np.sum(1.0 - links.probability)),
     }
     points = Points(path.middle_mm, arrays, reference, told, provenance)
-    return Tracked(points, TRACKS_FORMAT, [path], summary, settings)
+    return Tracked(points, TRACKS_FORMAT, lambda: iter([path]), summary, settings)
 
 
 def tracks_through(frames: Sequence[Seen], chosen: Tracking, found: Trajectories | None) -> SequenceTracks:

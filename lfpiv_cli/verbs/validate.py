@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -31,8 +32,12 @@ from lfpiv_cli.validation import methods as of_methods
 from lfpiv_cli.validation import weights as of_weights
 from lfpiv_cli.validation.flow import Duct, Measured, limits_missed, truth_at_points
 from lfpiv_cli.validation.volume import volume_figures
-from lfpiv_cli.verbs.chain import measure_images, simulate_images
-from lfpiv_cli.verbs.simulate import ensure_experiment
+from lfpiv_cli.verbs.build_weights import BuildWeightsOptions, build_weights_file
+from lfpiv_cli.verbs.calibrate import CalibrateOptions, calibrate_snapshot
+from lfpiv_cli.verbs.correlate import correlate_files
+from lfpiv_cli.verbs.reconstruct import ReconstructOptions, reconstruct_files
+from lfpiv_cli.verbs.simulate import board_at, board_depths, ensure_experiment, frame_names, simulate_images
+from lfpiv_cli.verbs.track import TrackOptions, track_particles
 from lfpiv_cli.verbs.validate_board import depths_in_volume, validate_board
 
 if TYPE_CHECKING:
@@ -205,6 +210,35 @@ def validate_flow(
     if missed:
         raise LimitMissedError(f"{paths['flow.json']}: {'; '.join(missed)}", summary)
     return summary
+
+
+def measure_images(
+    config: Path, images: Path, output: Path, *, overwrite: bool = False, console: Console = CONSOLE
+) -> dict[str, Path]:
+    """Measure the flow in images that `simulate_images` made, calibration included; return the vectors by method."""
+    settings, dark = load_config(config), images / "dark.tif"
+    common: dict[str, Any] = {"overwrite": overwrite, "console": console}
+    calibration, weights = output / "calibration.h5", output / "weights.h5"
+    depths = board_depths(settings) if settings.weights.method == "dlfc" else []
+    boards = [images / board_at(depth) for depth in depths] or [images / "board.tif"]
+    pictures = CalibrateOptions(white=[images / "white.tif"], dark=dark, board=boards, depth_mm=depths)
+    calibrate_snapshot(config, calibration, pictures, **common)
+    build_weights_file(config, weights, BuildWeightsOptions(calibration=calibration), **common)
+    pair = [images / name for name in frame_names(settings.simulation.frames)[:2]]
+    vectors: dict[str, Path] = {}
+    for method in settings.flow_methods():
+        options = ReconstructOptions(dark=dark)
+        if method == "particles":
+            options = replace(options, solver="particles", pairing="ab")
+        reconstruct_files(weights, pair, output / method, options, **common)
+        found = [output / method / f"{image.stem}.vtkhdf" for image in pair]
+        if method == "volumes":
+            vectors[method] = output / "vectors.vtkhdf"
+            correlate_files(found, vectors[method], **common)
+        else:
+            vectors[method] = output / "tracks_grid.vtkhdf"
+            track_particles(found, output / "tracks.vtkhdf", TrackOptions(grid=True), **common)
+    return vectors
 
 
 def duct_of(flow: FlowSection | None) -> Duct | None:
