@@ -25,7 +25,7 @@ from lfpiv_cli.optics.tracing import ObjectSpace
 from lfpiv_cli.particles.rounds import find_particles
 from lfpiv_cli.particles.search import Task, task_of
 from lfpiv_cli.particles.view import raw_view
-from lfpiv_cli.reconstruction.equations import Normalisers, normalisers
+from lfpiv_cli.reconstruction.solvers import Normalisers, normalisers
 from lfpiv_cli.robust import MAD_TO_SIGMA
 from lfpiv_cli.synthetic.board import BoardPlacement, render_board
 from lfpiv_cli.synthetic.render import Balls, Readout, render_points, render_white

@@ -13,8 +13,7 @@ from benchmarks.weights import PAPER_GRID, TABLE2, WATER, sparse_matrix
 from lfpiv_cli.calibration.board_pose import BoardGeometry
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.tracing import ObjectSpace
-from lfpiv_cli.reconstruction.equations import Image, Volume, normalisers
-from lfpiv_cli.reconstruction.solvers import SolverSettings, Stopping, reconstruct
+from lfpiv_cli.reconstruction.solvers import Image, SolverSettings, Stopping, Volume, normalisers, reconstruct
 from lfpiv_cli.synthetic.board import BoardPlacement, render_board
 from lfpiv_cli.weights.build import factorise
 from lfpiv_cli.weights.operators import FactorisedOperator

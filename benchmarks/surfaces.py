@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 
 from benchmarks.timing import interleaved_medians_s
 from lfpiv_cli.optics.camera import Camera, Lattice
-from lfpiv_cli.optics.curved_space import CurvedSpace, Face
+from lfpiv_cli.optics.curved_space import CurvedSpace, Face, aim_all
 from lfpiv_cli.optics.media import Media
-from lfpiv_cli.optics.ray_bundles import aim_all
 from lfpiv_cli.optics.surfaces import Cylinder
 from lfpiv_cli.optics.tracing import disc_points, exact_slope
 

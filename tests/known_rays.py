@@ -7,7 +7,7 @@ from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from lfpiv_cli.optics.camera import Camera
-from lfpiv_cli.optics.curved_space import CurvedSpace
+from lfpiv_cli.optics.curved_space import ROUNDING_MM, CurvedSpace, in_fluid, refracted, trace_in
 from lfpiv_cli.optics.media import (
     Media,
     Window,
@@ -15,7 +15,6 @@ from lfpiv_cli.optics.media import (
     fluid_path_to_focus,
     object_space_matrix,
 )
-from lfpiv_cli.optics.ray_bundles import ROUNDING_MM, in_fluid, refracted, trace_in
 from lfpiv_cli.optics.shapes import Vector, dot, plus, scaled
 from lfpiv_cli.optics.surfaces import Faces, meet
 from lfpiv_cli.optics.tracing import exact_slope

@@ -14,7 +14,7 @@ from lfpiv_cli.optics.media import Media
 from lfpiv_cli.particles.fitting import add_all
 from lfpiv_cli.particles.search import Task, task_of
 from lfpiv_cli.particles.view import raw_view
-from lfpiv_cli.reconstruction.equations import normalisers
+from lfpiv_cli.reconstruction.solvers import normalisers
 from lfpiv_cli.weights.build import default_padding, factorise
 from lfpiv_cli.weights.model import Weights
 

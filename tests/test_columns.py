@@ -76,7 +76,7 @@ def fitted_to(space, camera, depths_mm=(-1.5, -0.5, 0.5, 1.5, 2.5), twist=0.0):
     array = trace(camera, lens, slopes_equivalent(points, lens, camera, space.media)).array_mm
     array[:, 0] += twist * array[:, 1]
     scale, exponents = np.array([0.6, 0.6, 2.5, 12.5, 12.5]), complete_exponents(3)
-    terms = polynomial_terms(points, lens, scale, exponents)
+    terms = polynomial_terms(np.column_stack([points, lens]) / scale, exponents)
     return PolynomialRays(scale, exponents, np.linalg.lstsq(terms, array, rcond=None)[0])
 
 

@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.names import ColumnAxis
 from lfpiv_cli.optics.camera import Camera
-from lfpiv_cli.optics.curved_space import CurvedSpace, Face
+from lfpiv_cli.optics.curved_space import CurvedSpace, Face, aim, trace_in
 from lfpiv_cli.optics.media import Media, Window, fluid_path_to_focus
-from lfpiv_cli.optics.ray_bundles import aim, trace_in
 from lfpiv_cli.optics.shapes import Vector
 from lfpiv_cli.optics.surfaces import Cylinder, Plane, Sphere, Surface, TiltedPlane
 from lfpiv_cli.optics.tracing import ObjectSpace, disc_points

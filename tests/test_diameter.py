@@ -17,7 +17,7 @@ from lfpiv_cli.particles.diameter import NO_SIZES, Diameter, Sizes, Trial, _sett
 from lfpiv_cli.particles.fitting import add_all
 from lfpiv_cli.particles.search import Task, task_of
 from lfpiv_cli.particles.view import Light, entry_capacity, raw_view, with_radius
-from lfpiv_cli.reconstruction.equations import normalisers
+from lfpiv_cli.reconstruction.solvers import normalisers
 from lfpiv_cli.verbs.tracers import Diffusion, TracerSize, size_notices
 from lfpiv_cli.weights.build import default_padding, factorise
 from lfpiv_cli.weights.model import Weights

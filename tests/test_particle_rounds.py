@@ -20,7 +20,7 @@ from lfpiv_cli.particles.joining import boxes_of, explain_rest, find_peaks
 from lfpiv_cli.particles.rounds import ROUNDS, find_particles, first_pass, first_typical_light
 from lfpiv_cli.particles.search import noise_with, task_of
 from lfpiv_cli.particles.view import raw_view
-from lfpiv_cli.reconstruction.equations import normalisers
+from lfpiv_cli.reconstruction.solvers import normalisers
 from lfpiv_cli.scale import Scale
 from lfpiv_cli.synthetic.render import Balls, render_points
 from lfpiv_cli.validation.volume import particle_figures

@@ -10,13 +10,16 @@ import pytest
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.camera import Lattice
 from lfpiv_cli.reconstruction import solvers
-from lfpiv_cli.reconstruction.equations import Problem, line_of_sight_start, lit_support, normalisers
 from lfpiv_cli.reconstruction.registry import SOLVERS
 from lfpiv_cli.reconstruction.solvers import (
     Momentum,
+    Problem,
     SolverSettings,
     Stopping,
+    line_of_sight_start,
+    lit_support,
     mart_step,
+    normalisers,
     reconstruct,
     sart_step,
     smart_step,

@@ -17,8 +17,7 @@ from lfpiv_cli.optics.surfaces import Cylinder, Plane, Sphere, Surface, TiltedPl
 from lfpiv_cli.particles.fitting import add_all
 from lfpiv_cli.particles.noise import Noise
 from lfpiv_cli.particles.view import raw_view
-from lfpiv_cli.self_calibration.movable_scene import MovableScene, moved_places
-from lfpiv_cli.self_calibration.nuisances import Nuisances, fit_nuisances
+from lfpiv_cli.self_calibration.nuisances import MovableScene, Nuisances, fit_nuisances, moved_places
 from lfpiv_cli.self_calibration.scene_refinement import SceneRefinement, wall_by_places
 from lfpiv_cli.self_calibration.walls import find_round_wall
 

@@ -218,7 +218,7 @@ def locate_board(
         places, sigmas, numbers = look.measured(camera, board, rotation_rad, by)
         forward = camera.image_distance_mm / equivalent_object_distance(places[:, 2], camera.focus_distance_mm, medium)
         array = -forward[:, np.newaxis] * camera.to_image_axes(places)[:, :2]
-        return pose_of_dots(places, sigmas, array, camera, board, numbers), array
+        return pose_of_dots(places, sigmas, array, camera, board, numbers, medium), array
 
     try:
         look = LOOKS[board.pattern](image, passed, camera, board, medium)

@@ -127,6 +127,7 @@ GRID_TOLERANCE = 0.25
 FIRST_REACH = 2.3
 # A start that is a stray finds no grid; of these many some are not.
 STARTS = 8
+AIR = Media()
 
 
 @dataclass(frozen=True)
@@ -222,6 +223,7 @@ def pose_of_dots(
     camera: Camera,
     board: BoardGeometry,
     numbers: Integers | None = None,
+    medium: Media = AIR,
 ) -> BoardPose:
     """Fit a flat regular board to dots or corners.
 
@@ -231,6 +233,7 @@ def pose_of_dots(
     array_mm : (n, 2) where an ideal main lens would show them on the microlens array, image axes
     camera : that these places were computed with
     numbers : (n, 2) which point of the board each is, the board turned in any way; default: not known
+    medium : what the board stands in
 
     Raises
     ------
@@ -252,7 +255,7 @@ def pose_of_dots(
             break
         kept, indices = kept[good], indices[good]
         refuse_few(len(kept), board)
-    refuse_scattered(fit, board, camera)
+    refuse_scattered(fit, board, camera, medium)
     # What the camera already had and what the fit adds.
     k1, k1_sigma = fit.k1_per_mm2, fit.k1_sigma_per_mm2
     k1 = None if k1 is None else camera.distortion_per_mm2 + k1
@@ -349,7 +352,7 @@ def refuse_few(count: int, board: BoardGeometry) -> None:
         )
 
 
-def refuse_scattered(fit: FlatFit, board: BoardGeometry, camera: Camera) -> None:
+def refuse_scattered(fit: FlatFit, board: BoardGeometry, camera: Camera, medium: Media) -> None:
     """Raise when what was found lies about a grid and not on it, or in front of and behind its plane.
 
     The scatter is that of one point, by the misfit and how many numbers were fitted.
@@ -358,13 +361,13 @@ def refuse_scattered(fit: FlatFit, board: BoardGeometry, camera: Camera) -> None
     sideways = float(np.sqrt(2.0 * np.sum(fit.residual_mm[:, :2] ** 2) / max(1, freedom)))
     lens, lens_depth = lens_in_scene_mm(camera)
     if sideways > LARGEST_SCATTER * board.spacing_mm:
-        dot = board.dot_diameter_mm / lens
+        dot, further = board.dot_diameter_mm / lens, lens_depth / medium.depth_ratio
         check = "board.spacing_mm and that the picture shows the board"
         if board.pattern == "dots" and dot < 1.0 and sideways < lens:
             check = (
                 f"the focus first: dots {written(dot, 2)} microlenses wide may lie anywhere in their lenses near the "
-                f"focal plane; move the board by {written((2.0 - dot) * lens_depth, 2)} mm off it, or take dots of two "
-                f"microlenses, {written(2.0 * lens, 2)} mm; then {check}"
+                f"focal plane; move the board by {written((2.0 - dot) * further, 2)} mm off it, "
+                f"or take dots of two microlenses, {written(2.0 * lens, 2)} mm; then {check}"
             )
         raise InputError(
             f"what was found lies {written(sideways)} mm rms off a grid of {board.spacing_mm:g} mm, at most "

@@ -394,10 +394,10 @@ def polynomial_fit(
 
     That is the misfit (n, 2) in mm, and which rays were used (n,).
     """
-    largest = np.abs(np.concatenate([start_mm, crossing_mm], axis=1)).max(axis=0)
-    scale = np.maximum(largest, float(camera.lattice.pitch.min()))
+    variables = np.concatenate([start_mm, crossing_mm], axis=1)
+    scale = np.maximum(np.abs(variables).max(axis=0), float(camera.lattice.pitch.min()))
     exponents = complete_exponents(degree)
-    terms = polynomial_terms(start_mm, crossing_mm, scale, exponents)
+    terms = polynomial_terms(variables / scale, exponents)
     used = np.ones(len(terms), dtype=bool)
     for _ in range(FIT_ROUNDS):
         coefficients = np.asarray(np.linalg.lstsq(terms[used], array_mm[used], rcond=None)[0], dtype=np.float64)

@@ -221,22 +221,19 @@ class LatticeFit:
         )
 
 
-def fit_lattice(
-    white: ArrayLike, dark: ArrayLike | None = None, layout: Layout | None = None, saturation: float | None = None
-) -> LatticeFit:
+def fit_lattice(white: ArrayLike, dark: ArrayLike | None = None, layout: Layout | None = None) -> LatticeFit:
     """Find the lens images of a white image and fit a lattice and its cubic distortion.
 
     Parameters
     ----------
     white, dark : (rows, columns) photographs of uniform light and of none
     layout : of the microlens array, to be checked; default: what the image shows
-    saturation : level at which the camera saturates; default: that of its bits
 
     Raises
     ------
     InputError : when the image is too dark, saturated or shows no lattice
     """
-    image = checked_white(white, dark, saturation)
+    image = checked_white(white, dark)
     fit = _lattice_of(image, layout)
 
     # Light that falls towards the corners pulls the centroids of lens images to the middle, in proportion to the image

@@ -266,7 +266,7 @@ CAMERA_BITS = (8, 10, 12, 14, 16)
 FULL_PERCENTILE = 99.0
 
 
-def checked_white(white: ArrayLike, dark: ArrayLike | None, saturation: float | None) -> Floats:
+def checked_white(white: ArrayLike, dark: ArrayLike | None) -> Floats:
     """Return white minus dark, or say why it cannot be used."""
     raw = np.asarray(white)
     image = raw.astype(np.float64)
@@ -274,12 +274,11 @@ def checked_white(white: ArrayLike, dark: ArrayLike | None, saturation: float | 
         raise InputError(f"the white image has {image.ndim} axes, expected one grey image of rows and columns")
     if not np.isfinite(image).all():
         raise InputError("the white image holds values that are not numbers; export it again without them")
-    if saturation is None:
-        # The brightest value if some camera's counts end there; else the largest one that the integer type holds.
-        saturation = float(raw.max())
-        ends = {2**bits - 1 for bits in CAMERA_BITS} | {(2**bits - 1) << (16 - bits) for bits in CAMERA_BITS}
-        if raw.dtype.kind in "iu" and saturation not in ends:
-            saturation = float(np.iinfo(raw.dtype).max)
+    # The brightest value if some camera's counts end there; else the largest one that the integer type holds.
+    saturation = float(raw.max())
+    ends = {2**bits - 1 for bits in CAMERA_BITS} | {(2**bits - 1) << (16 - bits) for bits in CAMERA_BITS}
+    if raw.dtype.kind in "iu" and saturation not in ends:
+        saturation = float(np.iinfo(raw.dtype).max)
     clipped = float(np.mean(image >= saturation))
     if image.max() > image.min() and clipped > SATURATED_SHARE:
         raise InputError(

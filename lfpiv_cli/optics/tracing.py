@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
+from functools import cache
 from itertools import product
 from typing import Any
 
@@ -83,22 +84,26 @@ class PolynomialRays:
 
     def on_array(self, start_mm: ArrayLike, crossing_mm: ArrayLike) -> Floats:
         """Return where rays from (n, 3) through (n, 2) meet the array, (n, 2)."""
-        return polynomial_terms(start_mm, crossing_mm, self.scale_mm, self.exponents) @ self.coefficients_mm
+        rays = np.concatenate([np.atleast_2d(start_mm), np.atleast_2d(crossing_mm)], axis=1) / self.scale_mm
+        return polynomial_terms(rays, self.exponents) @ self.coefficients_mm
 
 
-def polynomial_terms(start_mm: ArrayLike, crossing_mm: ArrayLike, scale_mm: Floats, exponents: Integers) -> Floats:
-    """Return each term (n, terms) for rays from (n, 3) through (n, 2)."""
-    rays = np.concatenate([np.atleast_2d(start_mm), np.atleast_2d(crossing_mm)], axis=1) / scale_mm
-    terms = np.ones((len(rays), len(exponents)))
-    for variable in range(VARIABLES):
-        powers = rays[:, variable, np.newaxis] ** np.arange(int(exponents[:, variable].max(initial=0)) + 1)
-        terms *= powers[:, exponents[:, variable]]
+def polynomial_terms(variables: Floats, exponents: Integers) -> Floats:
+    """Return each term (n, terms) of variables (n, k), by the exponents (terms, k)."""
+    powers = variables[:, :, np.newaxis] ** np.arange(exponents.max(initial=0) + 1)
+    terms = powers[:, 0, exponents[:, 0]]
+    for k in range(1, variables.shape[1]):
+        terms = terms * powers[:, k, exponents[:, k]]
     return terms
 
 
-def complete_exponents(degree: int) -> Integers:
-    """Return the exponents (terms, 5) of all terms up to a degree: 21 of degree 2, 56 of degree 3."""
-    all_of_them = product(range(degree + 1), repeat=VARIABLES)
+@cache
+def complete_exponents(degree: int, *highest: int) -> Integers:
+    """Return the exponents of all terms up to a degree, of `VARIABLES` variables or of each up to a highest power.
+
+    Of five variables there are 21 of degree 2 and 56 of degree 3.
+    """
+    all_of_them = product(*(range(power + 1) for power in highest or VARIABLES * [degree]))
     return np.array([powers for powers in all_of_them if sum(powers) <= degree], dtype=np.int64)
 
 

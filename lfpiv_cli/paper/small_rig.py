@@ -27,8 +27,7 @@ from lfpiv_cli.optics.tracing import ObjectSpace
 from lfpiv_cli.particles.rounds import ROUNDS, Round, find_particles
 from lfpiv_cli.particles.search import task_of
 from lfpiv_cli.particles.view import lens_pixels, raw_view
-from lfpiv_cli.reconstruction.equations import normalisers
-from lfpiv_cli.reconstruction.solvers import SolverSettings, reconstruct
+from lfpiv_cli.reconstruction.solvers import SolverSettings, normalisers, reconstruct
 from lfpiv_cli.reference import Reference
 from lfpiv_cli.robust import MAD_TO_SIGMA
 from lfpiv_cli.synthetic.render import Balls, Readout, render_points

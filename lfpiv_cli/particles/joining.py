@@ -42,8 +42,7 @@ from lfpiv_cli.particles.least_squares import (
 from lfpiv_cli.particles.search import SAME_DEPTHS, SAME_LENSES, State, Task, observed
 from lfpiv_cli.particles.suspects import good_chi2
 from lfpiv_cli.particles.view import footprint_radius_mm, over_tiles
-from lfpiv_cli.reconstruction.equations import Normalisers, Problem, uniform_start
-from lfpiv_cli.reconstruction.solvers import em_step
+from lfpiv_cli.reconstruction.solvers import Normalisers, Problem, em_step, uniform_start
 from lfpiv_cli.scale import Scale
 from lfpiv_cli.weights.model import Weights
 

@@ -24,7 +24,7 @@ import numpy as np
 from numba import njit
 
 from lfpiv_cli.arrays import Floats
-from lfpiv_cli.optics.ray_bundles import aim, slope_turns, start_at_lens, trace_pencil
+from lfpiv_cli.optics.curved_space import aim, slope_turns, start_at_lens, trace_pencil
 from lfpiv_cli.optics.surfaces import Faces
 from lfpiv_cli.threads import COUNT_NO_REFERENCES
 

@@ -22,7 +22,7 @@ import numpy as np
 from numba import njit
 
 from lfpiv_cli.arrays import Floats
-from lfpiv_cli.optics.ray_bundles import aim, trace_in
+from lfpiv_cli.optics.curved_space import aim, trace_in
 from lfpiv_cli.optics.tracing import slope_polynomial, slope_ratio
 from lfpiv_cli.particles.pencil import cubic_at, largest_of, pencil_of
 from lfpiv_cli.particles.view import View

@@ -31,7 +31,7 @@ from lfpiv_cli.particles.noise import (
     read_noise,
 )
 from lfpiv_cli.particles.view import View, footprint_radius_mm, lens_pixels, on_array_mm
-from lfpiv_cli.reconstruction.equations import Normalisers
+from lfpiv_cli.reconstruction.solvers import Normalisers
 from lfpiv_cli.weights.model import Weights
 
 # Active sets: which particles the next sweep fits again, because their last fit or neighbours' fits changed

@@ -12,7 +12,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Literal
 
 if TYPE_CHECKING:
-    from lfpiv_cli.reconstruction.equations import Image, Problem, Volume
+    from lfpiv_cli.reconstruction.solvers import Image, Problem, Volume
 
     Step = Callable[[Problem, Volume, Image, float], Volume]
 

@@ -26,9 +26,8 @@ from lfpiv_cli.particles.refraction import places_by_snell
 from lfpiv_cli.particles.rounds import ROUNDS, find_particles
 from lfpiv_cli.particles.search import Particles, Task, task_of
 from lfpiv_cli.particles.view import Light, View, raw_view, with_radius
-from lfpiv_cli.reconstruction.equations import normalisers
-from lfpiv_cli.self_calibration.movable_scene import MovableScene
-from lfpiv_cli.self_calibration.nuisances import NuisanceFit, Nuisances, fit_nuisances
+from lfpiv_cli.reconstruction.solvers import normalisers
+from lfpiv_cli.self_calibration.nuisances import MovableScene, NuisanceFit, Nuisances, fit_nuisances
 from lfpiv_cli.self_calibration.walls import Walls, find_walls, refuse_few
 from lfpiv_cli.weights.build import default_padding, factorise
 from lfpiv_cli.weights.model import Weights

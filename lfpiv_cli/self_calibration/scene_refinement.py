@@ -30,17 +30,18 @@ from lfpiv_cli.particles.diameter import UNKNOWN_LENSES, diameter_by
 from lfpiv_cli.particles.rounds import find_particles
 from lfpiv_cli.particles.search import Task, task_of
 from lfpiv_cli.particles.view import View, footprint_radius_mm, on_array_mm, raw_view, with_radius
-from lfpiv_cli.reconstruction.equations import normalisers
-from lfpiv_cli.self_calibration.movable_scene import (
+from lfpiv_cli.reconstruction.solvers import normalisers
+from lfpiv_cli.self_calibration.nuisances import (
     ACROSS,
     AWAY,
+    SCENE_STEPS,
     TILT_ACROSS,
     TILT_AWAY,
     MovableScene,
+    Nuisances,
     moved_places,
     place_changes,
 )
-from lfpiv_cli.self_calibration.nuisances import SCENE_STEPS, Nuisances
 from lfpiv_cli.self_calibration.refinement import PLANES_APART, REFINING_ROUNDS, camera_figures, first_image, shift_px
 from lfpiv_cli.self_calibration.walls import RING_FROM, RoundWallFit, find_round_wall
 from lfpiv_cli.weights.columns import operator_of
@@ -68,7 +69,7 @@ class SceneRefinement:
     Attributes
     ----------
     scene : as the config, and an earlier refinement, have it
-    axis, covariance : (4,), (4, 4) where it lies, by all that tells; see `movable_scene`
+    axis, covariance : (4,), (4, 4) where it lies, by all that tells; see `nuisances.MovableScene`
     by_wall, by_wall_covariance : by where the particles end
     wall : the same, from `by_wall` on: what is left, radius and blur
     nuisances, nuisances_sigma : changes of the camera and of the particles' size by their images, and of the scene

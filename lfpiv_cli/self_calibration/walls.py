@@ -231,7 +231,7 @@ def _density(depth: Floats, parameters: Floats, edge: Floats, stray: float, sear
 # looked at, and each particle's distance for its own angle: where the wall cannot be seen, at a sensor's sides,
 # particles are left out, and a seeding that grows across the pipe does no harm.
 #
-# Axes: the pipe's frame (along, across, away), see `movable_scene`; lengths in mm.
+# Axes: the pipe's frame (along, across, away), see `nuisances.MovableScene`; lengths in mm.
 
 
 # The ring begins at this share of the radius: it holds half of the section, in which seeding changes evenly.

@@ -20,8 +20,7 @@ from scipy.special import ndtri
 
 from lfpiv_cli.arrays import Flags, Floats
 from lfpiv_cli.optics.camera import Camera, KernelCamera, Objective
-from lfpiv_cli.optics.curved_space import CurvedSpace
-from lfpiv_cli.optics.ray_bundles import aim, aim_all
+from lfpiv_cli.optics.curved_space import CurvedSpace, aim, aim_all
 from lfpiv_cli.optics.surfaces import Faces
 from lfpiv_cli.optics.tracing import struck_pixel, trace_ray
 from lfpiv_cli.threads import COUNT_NO_REFERENCES

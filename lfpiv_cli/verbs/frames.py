@@ -31,7 +31,6 @@ from lfpiv_cli.files.inputs import given
 from lfpiv_cli.files.provenance import seconds_between, sha256
 from lfpiv_cli.files.weights_file import WeightsFile
 from lfpiv_cli.notice import Notice, written
-from lfpiv_cli.reconstruction.equations import Normalisers, Operator, normalisers
 from lfpiv_cli.reconstruction.images import (
     Image,
     Mask,
@@ -43,6 +42,7 @@ from lfpiv_cli.reconstruction.images import (
     still_light,
     touched,
 )
+from lfpiv_cli.reconstruction.solvers import Normalisers, Operator, normalisers
 from lfpiv_cli.robust import HALF_NORMAL_MEDIAN, MAD_TO_SIGMA
 
 # Beyond so much the two are not the same.

@@ -34,8 +34,8 @@ from lfpiv_cli.particles.neighbour_frames import second_frame, second_pass
 from lfpiv_cli.particles.rounds import ROUNDS, first_pass
 from lfpiv_cli.particles.search import LAST_UNEXPLAINED, Particles, Task, result, task_of
 from lfpiv_cli.particles.view import Light, View, ensure_square_cells, raw_view
-from lfpiv_cli.reconstruction.equations import Normalisers
 from lfpiv_cli.reconstruction.images import Image, Mask, filled, light
+from lfpiv_cli.reconstruction.solvers import Normalisers
 from lfpiv_cli.tracks.tracking import SEARCH_LENSES
 from lfpiv_cli.verbs.frames import (
     IMAGE,

@@ -21,9 +21,8 @@ from lfpiv_cli.files.pages import ensure_drawing, write_picture
 from lfpiv_cli.files.provenance import record
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.tracing import ObjectSpace
-from lfpiv_cli.reconstruction.equations import normalisers
 from lfpiv_cli.reconstruction.images import Image, Mask, light
-from lfpiv_cli.reconstruction.solvers import ALL_ITERATIONS, Reconstruction, reconstruct
+from lfpiv_cli.reconstruction.solvers import ALL_ITERATIONS, Reconstruction, normalisers, reconstruct
 from lfpiv_cli.synthetic.board import BoardPlacement, dot_centres, render_board
 from lfpiv_cli.synthetic.scenes import RecordingCamera, simulate_board, simulate_white
 from lfpiv_cli.validation import board as of_boards

@@ -37,37 +37,36 @@ SMALLEST_SHARE = 1e-7
 MOST_CORNERS = 12
 
 
-@dataclass(frozen=True, eq=False)
-class Bending:
-    """How rays from the planes of a volume are bent on their way to the array, along one axis.
+class Bending(NamedTuple):
+    """How rays from the planes of a volume are bent on their way to the array, along one axis: traced, or fitted.
 
     Attributes
     ----------
-    nodes, factors : (planes, depth nodes, k) of `tracing.slope_ratio` at the depth nodes of each plane
-    beside_mm2 : mean square of the voxels' distance from the optical axis along the other axis
     strips : straight pieces in which the aperture is worked on; 1 where rays are straight in front of the lens
+    nodes, factors : (planes, depth nodes, k) of `tracing.slope_ratio` at the depth nodes of each plane where traced
+    beside_mm2 : mean square of the voxels' distance from the optical axis along the other axis where traced
+    coefficients_mm : (planes, depth nodes, degree + 1, degree + 1) of the place on the array by the powers of x and X
+        where fitted; without powers where traced
+    scale_mm : (2,) what x and X are divided by
     """
 
+    strips: int
     nodes: Floats
     factors: Floats
-    beside_mm2: float = 0.0
-    strips: int = 1
-
-
-@dataclass(frozen=True, eq=False)
-class FittedBending:
-    """How rays from the planes of a volume meet the array, along one axis, as polynomials.
-
-    Attributes
-    ----------
-    coefficients_mm : (planes, depth nodes, degree + 1, degree + 1) of the place on the array by the powers of x and X
-    scale_mm : (2,) what x and X are divided by
-    strips : straight pieces in which the aperture is worked on
-    """
-
+    beside_mm2: float
     coefficients_mm: Floats
     scale_mm: Floats
-    strips: int
+
+    @classmethod
+    def traced(cls, nodes: Floats, factors: Floats, beside_mm2: float, strips: int) -> Bending:
+        """Return how traced rays are bent."""
+        return cls(strips, nodes, factors, beside_mm2, np.zeros((*nodes.shape[:2], 0, 0)), np.ones(2))
+
+    @classmethod
+    def fitted(cls, coefficients_mm: Floats, scale_mm: Floats, strips: int) -> Bending:
+        """Return how fitted rays are bent."""
+        none = np.zeros((*coefficients_mm.shape[:2], 1))
+        return cls(strips, none, none, 0.0, coefficients_mm, scale_mm)
 
 
 class AxisScene(NamedTuple):
@@ -75,29 +74,18 @@ class AxisScene(NamedTuple):
 
     Attributes
     ----------
-    optics : the axis
-    first_lens, cell_start, cell_pixel : of `Cells`
+    optics, cells : of the axis
     centres_mm, width_mm : (n,) of the voxels along the axis
     node_share : (nodes,) share of a voxel's light from each depth node
-    nodes, factors, beside_mm2 : of `Bending` where rays are traced
-    fitted_mm, scale_mm : coefficients and scale of `FittedBending` where they are fitted; without coefficients where
-        traced
-    strips : of either
+    bending : of the rays
     """
 
     optics: AxisOptics
-    first_lens: int
-    cell_start: Integers
-    cell_pixel: NDArray[np.int32]
+    cells: Cells
     centres_mm: Floats
     width_mm: float
     node_share: Floats
-    nodes: Floats
-    factors: Floats
-    beside_mm2: float
-    fitted_mm: Floats
-    scale_mm: Floats
-    strips: int
+    bending: Bending
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,9 +123,7 @@ class AxisWeights:
         return dense
 
 
-def axis_weights(
-    optics: AxisOptics, centres_mm: Floats, width_mm: float, bending: Bending | FittedBending
-) -> AxisWeights:
+def axis_weights(optics: AxisOptics, centres_mm: Floats, width_mm: float, bending: Bending) -> AxisWeights:
     """Integrate the weights of all voxels along one axis.
 
     Parameters
@@ -146,29 +132,10 @@ def axis_weights(
     width_mm : their width
     bending : of the rays in front of the array
     """
-    if isinstance(bending, FittedBending):
-        fitted, scale = bending.coefficients_mm, bending.scale_mm
-        slopes = np.zeros((*fitted.shape[:2], 1))
-        traced = Bending(slopes, slopes)
-    else:
-        fitted, scale, traced = np.zeros((*bending.nodes.shape[:2], 0, 0)), np.ones(2), bending
-    planes, nodes = fitted.shape[:2]
+    planes, nodes = bending.nodes.shape[:2]
     cells = micro_image_cells(optics)
-    scene = AxisScene(
-        optics=optics,
-        first_lens=cells.first_lens,
-        cell_start=cells.start,
-        cell_pixel=cells.pixel,
-        centres_mm=centres_mm,
-        width_mm=width_mm,
-        node_share=np.polynomial.legendre.leggauss(nodes)[1] / 2.0,
-        nodes=traced.nodes,
-        factors=traced.factors,
-        beside_mm2=traced.beside_mm2,
-        fitted_mm=fitted,
-        scale_mm=scale,
-        strips=bending.strips,
-    )
+    node_share = np.polynomial.legendre.leggauss(nodes)[1] / 2.0
+    scene = AxisScene(optics, cells, centres_mm, width_mm, node_share, bending)
     counts = np.zeros(planes * centres_mm.size, np.int64)
     nothing = (np.zeros(0, np.int64), counts, np.zeros(0, np.int32), np.zeros(0, np.float32))
     share_out(_integrate, planes, scene, *nothing)
@@ -199,20 +166,21 @@ def _integrate(
     """
     voxels = scene.centres_mm.size
     optics, camera, width = scene.optics, scene.optics.camera, scene.width_mm
+    cells, bending = scene.cells, scene.bending
     s_i, s_mu = camera.image_distance_mm, camera.microlens_distance_mm
     bend, radius = camera.bend, camera.aperture_radius_mm
-    side = 2.0 * radius / scene.strips
-    shares = np.zeros(scene.cell_pixel.size)
+    side = 2.0 * radius / bending.strips
+    shares = np.zeros(cells.pixel.size)
     work = np.empty((4, MOST_CORNERS, 2))
     rectangle, upper, lens, scratch = work[0], work[1], work[2], work[3]
     for row in range(part[0] * voxels, part[1] * voxels):
         plane, centre = row // voxels, scene.centres_mm[row % voxels]
         # The first cell touched and the one behind the last.
-        begin, end = scene.cell_pixel.size, 0
-        for task in range(scene.node_share.size * scene.strips):
+        begin, end = cells.pixel.size, 0
+        for task in range(scene.node_share.size * bending.strips):
             # In each strip of X the ray's place on the array is linear, x_m = alpha X - scale x + offset, right at both
             # ends.
-            node, strip = task // scene.strips, task % scene.strips
+            node, strip = task // bending.strips, task % bending.strips
             low, high = strip * side - radius, (strip + 1) * side - radius
             set_rectangle(rectangle, centre - 0.5 * width, centre + 0.5 * width, low, high)
             place_low, scale_low = _array_place(scene, plane, node, centre, low)
@@ -225,8 +193,8 @@ def _integrate(
             last = int(np.floor((highest - optics.lens_origin_mm) / optics.lens_pitch_mm + 0.5))
             a = beta * bend + s_mu * beta / s_i
             b = alpha * bend + s_mu * (alpha - 1.0) / s_i
-            for n in range(max(first, scene.first_lens), min(last, scene.first_lens + scene.cell_start.size - 2) + 1):
-                at, stop = scene.cell_start[n - scene.first_lens], scene.cell_start[n - scene.first_lens + 1]
+            for n in range(max(first, cells.first_lens), min(last, cells.first_lens + cells.start.size - 2) + 1):
+                at, stop = cells.start[n - cells.first_lens], cells.start[n - cells.first_lens + 1]
                 s = optics.lens_origin_mm + n * optics.lens_pitch_mm
                 corners = cut(rectangle[:4], beta, alpha, s + 0.5 * optics.lens_width_mm - offset, upper)
                 corners = cut(upper[:corners], -beta, -alpha, -(s - 0.5 * optics.lens_width_mm - offset), lens)
@@ -234,7 +202,7 @@ def _integrate(
                     continue
                 share = scene.node_share[node] / (2.0 * radius * width)
                 shift = s * (1.0 - bend) + offset * (bend + s_mu / s_i)
-                pixels = scene.cell_pixel[at:stop]
+                pixels = cells.pixel[at:stop]
                 _add_lens(optics, lens[:corners], (a, b, shift), pixels, share, scratch, shares[at:stop])
                 begin, end = min(begin, at), max(end, stop)
         found = 0
@@ -255,9 +223,10 @@ def _array_place(scene: AxisScene, plane: int, node: int, centre: float, crossin
     Where rays are traced, the other axis enters by its mean square distance: of a disc's chord at X, a third of its
     half length squared, and of the voxels.
     """
-    fitted = scene.fitted_mm[plane, node]
+    bending = scene.bending
+    fitted = bending.coefficients_mm[plane, node]
     if fitted.shape[0] > 0:
-        x, across = centre / scene.scale_mm[0], crossing / scene.scale_mm[1]
+        x, across = centre / bending.scale_mm[0], crossing / bending.scale_mm[1]
         place, slope = 0.0, 0.0
         for a in range(fitted.shape[0] - 1, -1, -1):
             part = 0.0
@@ -265,13 +234,13 @@ def _array_place(scene: AxisScene, plane: int, node: int, centre: float, crossin
                 part = part * across + fitted[a, b]
             slope = slope * x + place
             place = place * x + part
-        return place, -slope / scene.scale_mm[0]
+        return place, -slope / bending.scale_mm[0]
     camera = scene.optics.camera
     s_i, radius = camera.image_distance_mm, camera.aperture_radius_mm
     lateral = crossing - centre
     chord = max(radius * radius - crossing * crossing, 0.0) / 3.0
-    lateral2 = lateral * lateral + chord + scene.beside_mm2
-    ratio = slope_ratio(lateral2, scene.nodes[plane, node], scene.factors[plane, node])
+    lateral2 = lateral * lateral + chord + bending.beside_mm2
+    ratio = slope_ratio(lateral2, bending.nodes[plane, node], bending.factors[plane, node])
     return crossing + s_i * (ratio * lateral - crossing / camera.focal_length_mm), s_i * ratio
 
 

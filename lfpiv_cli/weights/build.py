@@ -6,7 +6,6 @@ in the frame that the array is aligned with (`rectified`), x and y lateral, z aw
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -19,8 +18,8 @@ from lfpiv_cli.optics.camera import Camera, Lattice
 from lfpiv_cli.optics.curved_space import CurvedSpace
 from lfpiv_cli.optics.media import Media, equivalent_object_distance
 from lfpiv_cli.optics.tracing import ObjectSpace, PolynomialRays, disc_points
-from lfpiv_cli.weights.axis import Bending, FittedBending, axis_weights, depth_nodes
-from lfpiv_cli.weights.lens_cells import AxisOptics, aperture_mask
+from lfpiv_cli.weights.axis import Bending, axis_weights, depth_nodes
+from lfpiv_cli.weights.lens_cells import AxisOptics, Optics, aperture_mask
 from lfpiv_cli.weights.operators import BrickOperator, FactorisedOperator
 from lfpiv_cli.weights.scene import Source
 from lfpiv_cli.weights.strip_blocks import StripLayout, strip_layout
@@ -46,16 +45,39 @@ def factorise(camera: Camera, media: Media, grid: Grid) -> FactorisedOperator:
     return factorise_through(camera, ObjectSpace(media, None, "paraxial"), grid)
 
 
-def factorise_through(camera: Camera, source: ObjectSpace | PolynomialRays, grid: Grid) -> FactorisedOperator:
+def factorise_through(
+    camera: Camera, source: ObjectSpace | PolynomialRays, grid: Grid, optics: Optics | None = None
+) -> FactorisedOperator:
     """Return the weights of all voxels of a grid seen along traced or fitted rays, in factorised form.
 
-    Exact refraction, and fitted rays, couple the axes; each axis takes the other's mean.
+    Exact refraction, and fitted rays, couple the axes; each axis takes the other's mean. The camera's two axes may be
+    given.
 
     Raises
     ------
     ConfigError : the array's axes do not separate, or a voxel lies where it cannot be.
     """
-    return _factorised(axis_optics(camera), camera, source, grid)
+    columns, rows = optics or axis_optics(camera)
+    x, y = (0, 1) if camera.column_axis == "x" else (1, 0)
+    if isinstance(source, PolynomialRays):
+        bent = [fitted_bending(source, camera, grid, axis) for axis in (0, 1)]
+    else:
+        depths = depth_nodes(grid.axis_mm(2), grid.spacing_mm[2])
+        if equivalent_object_distance(depths.min(), camera.focus_distance_mm, source.media) <= 0.0:
+            raise ConfigError(
+                f"volume: its nearest point lies {written(grid.bounds_mm(2)[0], 4)} mm from the focal point, behind "
+                "the main lens"
+            )
+        reach = camera.aperture_radius_mm + float(np.hypot(*(np.abs(grid.bounds_mm(axis)).max() for axis in (0, 1))))
+        nodes, factors = (
+            table.reshape(*depths.shape, -1) for table in source.slope_polynomials(camera, depths.ravel(), reach)
+        )
+        beside = [float(np.mean(grid.axis_mm(other) ** 2)) for other in (y, x)]
+        bent = [Bending.traced(nodes, factors, each, 1 if source.straight else STRIPS) for each in beside]
+    along_columns = axis_weights(columns, grid.axis_mm(x), grid.spacing_mm[x], bent[0])
+    along_rows = axis_weights(rows, grid.axis_mm(y), grid.spacing_mm[y], bent[1])
+    mask = aperture_mask(along_columns.cells, along_rows.cells, camera.aperture_radius_mm)
+    return FactorisedOperator(along_columns, along_rows, mask)
 
 
 def factorise_bricks(camera: Camera, media: Media, grid: Grid) -> BrickOperator:
@@ -80,40 +102,13 @@ def factorise_bricks(camera: Camera, media: Media, grid: Grid) -> BrickOperator:
         Lattice(lattice.origin + row * lattice.basis[1], np.diag([pitch, 2.0 * height]), "square") for row in (0, 1)
     ]
     even, odd = (
-        _factorised(axis_optics(replace(camera, lattice=each), (pitch, height)), camera, space, grid) for each in rows
+        factorise_through(camera, space, grid, axis_optics(replace(camera, lattice=each), (pitch, height)))
+        for each in rows
     )
     return BrickOperator(even, odd)
 
 
-def _factorised(
-    optics: tuple[AxisOptics, AxisOptics], camera: Camera, source: ObjectSpace | PolynomialRays, grid: Grid
-) -> FactorisedOperator:
-    """Return the weights of a grid through an array whose two axes are given."""
-    columns, rows = optics
-    x, y = (0, 1) if camera.column_axis == "x" else (1, 0)
-    bent: Sequence[Bending | FittedBending]
-    if isinstance(source, PolynomialRays):
-        bent = [fitted_bending(source, camera, grid, axis) for axis in (0, 1)]
-    else:
-        depths = depth_nodes(grid.axis_mm(2), grid.spacing_mm[2])
-        if equivalent_object_distance(depths.min(), camera.focus_distance_mm, source.media) <= 0.0:
-            raise ConfigError(
-                f"volume: its nearest point lies {written(grid.bounds_mm(2)[0], 4)} mm from the focal point, behind "
-                "the main lens"
-            )
-        reach = camera.aperture_radius_mm + float(np.hypot(*(np.abs(grid.bounds_mm(axis)).max() for axis in (0, 1))))
-        nodes, factors = (
-            table.reshape(*depths.shape, -1) for table in source.slope_polynomials(camera, depths.ravel(), reach)
-        )
-        beside = [float(np.mean(grid.axis_mm(other) ** 2)) for other in (y, x)]
-        bent = [Bending(nodes, factors, each, 1 if source.straight else STRIPS) for each in beside]
-    along_columns = axis_weights(columns, grid.axis_mm(x), grid.spacing_mm[x], bent[0])
-    along_rows = axis_weights(rows, grid.axis_mm(y), grid.spacing_mm[y], bent[1])
-    mask = aperture_mask(along_columns.cells, along_rows.cells, camera.aperture_radius_mm)
-    return FactorisedOperator(along_columns, along_rows, mask)
-
-
-def fitted_bending(rays: PolynomialRays, camera: Camera, grid: Grid, axis: int) -> FittedBending:
+def fitted_bending(rays: PolynomialRays, camera: Camera, grid: Grid, axis: int) -> Bending:
     """Return the polynomials along the columns (axis 0) or rows (1), the other axis taken at its mean.
 
     Of the other axis the powers of y enter by their mean over the voxels; of Y the odd ones vanish and the square is
@@ -137,7 +132,7 @@ def fitted_bending(rays: PolynomialRays, camera: Camera, grid: Grid, axis: int) 
         else:
             table[..., x, crossing] += chord[0] * part
             table[..., x, crossing + 2] += chord[1] * part
-    return FittedBending(table, rays.scale_mm[list(own)], STRIPS)
+    return Bending.fitted(table, rays.scale_mm[list(own)], STRIPS)
 
 
 def separates(camera: Camera, source: Source, grid: Grid) -> bool:
@@ -178,7 +173,7 @@ def aligned(camera: Camera) -> bool:
     return camera.lattice.layout == "square" and bool(stray_px.max() <= ALIGNED_PX)
 
 
-def axis_optics(camera: Camera, widths_mm: tuple[float, float] | None = None) -> tuple[AxisOptics, AxisOptics]:
+def axis_optics(camera: Camera, widths_mm: tuple[float, float] | None = None) -> Optics:
     """Return the camera's two axes, (columns, rows); the widths of the lenses are their pitches if not given."""
     basis = camera.lattice.basis
     pixels = np.array([camera.columns, camera.rows])

@@ -27,7 +27,7 @@ from lfpiv_cli.optics.curved_space import CurvedSpace
 from lfpiv_cli.optics.tracing import struck_pixel
 from lfpiv_cli.robust import BRIGHTEST_PERCENTILE, LIT_SHARE
 from lfpiv_cli.threads import share_out
-from lfpiv_cli.weights.build import axis_optics, factorise_through, separates, strips_of
+from lfpiv_cli.weights.build import factorise_through, separates, strips_of
 from lfpiv_cli.weights.operators import Column, FactorisedOperator, WeightsOperator
 from lfpiv_cli.weights.quadrature import DEPTH_NODES, TILES, Columns, integrate_columns
 from lfpiv_cli.weights.scene import Scene, Source, kernel_scene, lit_voxels, on_array, on_sensor, rays_from
@@ -223,7 +223,7 @@ def operator_of(camera: Camera, source: Source, grid: Grid) -> FactorisedOperato
     """
     if isinstance(source, CurvedSpace):
         if layout := strips_of(camera, source, grid):
-            return factorise_strips(camera, source, grid, axis_optics(camera), layout.turned)
+            return factorise_strips(layout.scene)
     elif separates(camera, source, grid):
         return factorise_through(camera, source, grid)
     return OnDemandOperator(camera, source, grid)
@@ -280,8 +280,8 @@ def _seen_shares(part: tuple[int, int], scene: Scene, lit: Flags, seen: Floats) 
     for n in range(part[0], part[1]):
         point, total, found = scene.centres_mm[n], 0.0, 0.0
         rays = rays_from(scene, point, scene.plane[n], middle)
-        for t in range(scene.tile_share.size if rays.shape[1] > 0 else 0):
-            crossing = scene.tile_mm[t]
+        for t in range(scene.tiles.share.size if rays.shape[1] > 0 else 0):
+            crossing = scene.tiles.middle_mm[t]
             x, y = on_array(scene, point, rays, crossing[0], crossing[1])
             distorted = 1.0 + camera.distortion_per_mm2 * (x * x + y * y)
             m_x, m_y = x * distorted, y * distorted
@@ -290,6 +290,6 @@ def _seen_shares(part: tuple[int, int], scene: Scene, lit: Flags, seen: Floats) 
             y = on_sensor(camera, y, crossing[1], m_y, centre_y)
             pixel = struck_pixel(camera, x, y)
             if pixel >= 0:
-                total += scene.tile_share[t]
-                found += scene.tile_share[t] * lit[pixel]
+                total += scene.tiles.share[t]
+                found += scene.tiles.share[t] * lit[pixel]
         seen[n] = found / total if total > 0.0 else 0.0

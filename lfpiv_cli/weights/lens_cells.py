@@ -5,7 +5,6 @@ Axes: image axes on the array, mm.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -46,8 +45,11 @@ class AxisOptics(NamedTuple):
     pixels: int
 
 
-@dataclass(frozen=True, eq=False)
-class Cells:
+# Along the columns, and along the rows.
+Optics = tuple[AxisOptics, AxisOptics]
+
+
+class Cells(NamedTuple):
     """The cells of one axis, lens by lens and pixel by pixel.
 
     Attributes
@@ -81,11 +83,8 @@ def micro_image_cells(optics: AxisOptics) -> Cells:
     start = np.concatenate([[0], np.cumsum(counts)])
     owner = np.repeat(np.arange(lens.size), counts)
     pixel = low[owner] + np.arange(start[-1]) - start[owner]
-    magnify, radius, centre = (
-        camera.image_distance_mm / camera.microlens_distance_mm,
-        camera.aperture_radius_mm,
-        lens[owner],
-    )
+    magnify, radius = camera.image_distance_mm / camera.microlens_distance_mm, camera.aperture_radius_mm
+    centre = lens[owner]
     edges = (pixel[:, np.newaxis] + np.array([1, 0]) - 0.5 * optics.pixels) * camera.pixel_mm
     patch = np.clip(centre[:, np.newaxis] - (edges - centre[:, np.newaxis]) * magnify, -radius, radius)
     # A cell that only rays away from the lens's centre reach sees the very edge of the aperture.

@@ -20,8 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from lfpiv_cli.arrays import Floats, Integers, Singles
 from lfpiv_cli.optics.camera import Camera, KernelCamera
-from lfpiv_cli.optics.curved_space import CurvedSpace
-from lfpiv_cli.optics.ray_bundles import aim
+from lfpiv_cli.optics.curved_space import CurvedSpace, aim
 from lfpiv_cli.optics.surfaces import Faces
 from lfpiv_cli.optics.tracing import ObjectSpace, slope_ratio, struck_pixel, trace_ray
 from lfpiv_cli.threads import share_out
@@ -187,7 +186,7 @@ def _set_boxes(part: tuple[int, int], scene: Scene, boxes: Integers) -> None:
 @njit(cache=True, nogil=True)
 def _fill(part: tuple[int, int], scene: Scene, boxes: Integers, first: int, pictures: Floats) -> None:
     """Add up the light of the voxels from `first` on in pictures `part` of (voxels, rows, columns of their boxes)."""
-    work = np.empty((2, MOST_CORNERS, 2))
+    tiles, work = scene.tiles, np.empty((2, MOST_CORNERS, 2))
     lines = np.empty((2, MOST_PIXELS))
     for n in range(part[0], part[1]):
         voxel, box = first + n, boxes[first + n]
@@ -195,9 +194,9 @@ def _fill(part: tuple[int, int], scene: Scene, boxes: Integers, first: int, pict
         for k in range(0 if box[0] == box[2] or box[1] == box[3] else scene.depth_share.size):
             rays = rays_at_depth(scene, scene.centres_mm[voxel], plane, k, point)
             half = _half_face(scene, point, plane, k)
-            for t in range(scene.tile_share.size):
-                x, y = on_array(scene, point, rays, scene.tile_mm[t, 0], scene.tile_mm[t, 1])
-                tile = (scene.tile_mm[t, 0], scene.tile_mm[t, 1], scene.tile_share[t] * scene.depth_share[k])
+            for t in range(tiles.share.size):
+                x, y = on_array(scene, point, rays, tiles.middle_mm[t, 0], tiles.middle_mm[t, 1])
+                tile = (tiles.middle_mm[t, 0], tiles.middle_mm[t, 1], tiles.share[t] * scene.depth_share[k])
                 _add_tile(scene, (x, y, half[0], half[1]), tile, box, work, lines, pictures[n])
 
 
@@ -227,7 +226,7 @@ def _add_tile(
     array_x, array_y = x * distorted, y * distorted
     low, high = (array_x - half_x, array_y - half_y), (array_x + half_x, array_y + half_y)
     spread = abs(1.0 + s_mu / s_i - s_mu / f_m) / camera.pixel_mm
-    width = scene.tile_side_mm * s_mu / s_i / camera.pixel_mm
+    width = scene.tiles.side_mm * s_mu / s_i / camera.pixel_mm
     determinant = basis[0, 0] * basis[1, 1] - basis[0, 1] * basis[1, 0]
     dx, dy = array_x - origin[0], array_y - origin[1]
     i0 = np.rint((dx * basis[1, 1] - dy * basis[1, 0]) / determinant)

@@ -8,7 +8,7 @@ Axes: everything here is in image axes (x along the columns), mm, z away from th
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -17,8 +17,7 @@ from numba import njit
 from lfpiv_cli.arrays import Flags, Floats, Integers
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.camera import Camera, KernelCamera
-from lfpiv_cli.optics.curved_space import CurvedSpace
-from lfpiv_cli.optics.ray_bundles import aim
+from lfpiv_cli.optics.curved_space import CurvedSpace, aim
 from lfpiv_cli.optics.surfaces import Faces
 from lfpiv_cli.optics.tracing import (
     SLOPE_NODES,
@@ -89,8 +88,7 @@ NO_FACES = Faces(0.0, 1.0, 1.0, np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0,
 Source = ObjectSpace | PolynomialRays | CurvedSpace
 
 
-@dataclass(frozen=True, eq=False)
-class Tiles:
+class Tiles(NamedTuple):
     """Squares on the main lens: middles (n, 2) of their parts inside the aperture, shares (n,) of it, their side."""
 
     middle_mm: Floats
@@ -112,7 +110,7 @@ class Scene(NamedTuple):
     degree : of the polynomial; 0 where there is none
     faces, aimed_mm, aimed_fit : behind curved faces these, the crossings (m, 2) of the rays traced from each point, and
         what takes their places on the array to the polynomial in X and Y, ((degree + 1)^2, m); else no rays
-    tile_mm, tile_share, tile_side_mm : of `Tiles`
+    tiles : of the main lens
     cell_radius_mm, neighbours_mm : of a microlens's region, and (k, 2) the steps to the lenses around
     """
 
@@ -130,9 +128,7 @@ class Scene(NamedTuple):
     faces: Faces
     aimed_mm: Floats
     aimed_fit: Floats
-    tile_mm: Floats
-    tile_share: Floats
-    tile_side_mm: float
+    tiles: Tiles
     cell_radius_mm: float
     neighbours_mm: Floats
 
@@ -164,7 +160,6 @@ def kernel_scene(
     ------
     ConfigError : a voxel in front of the fluid, or no window where one is needed
     """
-    tiles = aperture_tiles(camera.aperture_radius_mm, tiles_per_side)
     # A lens's region reaches as far as half the basis cell's long diagonal.
     first, second = camera.lattice.basis
     depth, plane = np.unique(centres[:, 2], return_inverse=True)
@@ -198,9 +193,7 @@ def kernel_scene(
         faces=faces,
         aimed_mm=aimed,
         aimed_fit=aimed_fit,
-        tile_mm=tiles.middle_mm,
-        tile_share=tiles.share,
-        tile_side_mm=tiles.side_mm,
+        tiles=aperture_tiles(camera.aperture_radius_mm, tiles_per_side),
         cell_radius_mm=0.5 * float(max(np.hypot(*(first + second)), np.hypot(*(first - second)))),
         neighbours_mm=neighbours(camera.lattice),
     )

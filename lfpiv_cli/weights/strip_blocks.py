@@ -23,7 +23,7 @@ from lfpiv_cli.optics.curved_space import CurvedSpace
 from lfpiv_cli.simd import GROUP, TILE
 from lfpiv_cli.weights.axis import axis_weights, depth_nodes
 from lfpiv_cli.weights.kernels import PLACES, SLAB, STRIP, Blocks
-from lfpiv_cli.weights.lens_cells import AxisOptics, Cells, aperture_mask, micro_image_cells
+from lfpiv_cli.weights.lens_cells import Cells, Optics, aperture_mask, micro_image_cells
 from lfpiv_cli.weights.quadrature import integrate_columns
 from lfpiv_cli.weights.scene import lit_voxels, places_on_array
 from lfpiv_cli.weights.strip_fits import (
@@ -87,7 +87,7 @@ class StripScene:
     camera: Camera
     space: CurvedSpace
     grid: Grid
-    optics: tuple[AxisOptics, AxisOptics]
+    optics: Optics
     cells: tuple[Cells, Cells]
     order: NDArray[np.int32]
     tile: Integers
@@ -118,9 +118,7 @@ class Block(NamedTuple):
     rows: Factor
 
 
-def strip_scene(
-    camera: Camera, space: CurvedSpace, grid: Grid, optics: tuple[AxisOptics, AxisOptics], lit: Flags, turned: bool
-) -> StripScene:
+def strip_scene(camera: Camera, space: CurvedSpace, grid: Grid, optics: Optics, lit: Flags, turned: bool) -> StripScene:
     """Return what blocks are made of, strips being of rows of voxels, or of columns where `turned`."""
     cells = micro_image_cells(optics[0]), micro_image_cells(optics[1])
     lines, across = (lit.swapaxes(1, 2), 0) if turned else (lit, 1)
@@ -351,32 +349,31 @@ PARTS_JUDGED, RAYS_JUDGED = (5, 3), 2048
 # is then 0.003 to 0.005.
 SAMPLE, SAMPLE_TILES = 48, 64
 
-Optics = tuple[AxisOptics, AxisOptics]
-
 
 class StripLayout(NamedTuple):
     """How a volume is cut into strips.
 
     Attributes
     ----------
-    turned : into strips of columns of voxels, not of rows
-    strips, parts : how many, and how many pairs of factors each has, on average
+    scene : what their blocks are made of
+    parts : how many pairs of factors each strip has, on average
     """
 
-    turned: bool
-    strips: int
+    scene: StripScene
     parts: float
+
+    @property
+    def strips(self) -> int:
+        """How many there are."""
+        return -(-self.scene.lit.shape[1] // STRIP)
 
 
 def strip_layout(camera: Camera, space: CurvedSpace, grid: Grid, optics: Optics) -> StripLayout | None:
     """Return strips of rows of voxels or of columns, what needs fewer parts; None where rays separate in neither."""
     lit = lit_voxels(camera, space, grid)
-    found = []
-    for turned in (False, True):
-        scene = strip_scene(camera, space, grid, optics, lit, turned)
-        off, parts = _judged(scene)
-        if off < LARGEST_STRAY_LEFT:
-            found.append(StripLayout(turned, -(-scene.lit.shape[1] // STRIP), parts))
+    scenes = [strip_scene(camera, space, grid, optics, lit, turned) for turned in (False, True)]
+    judged = [(scene, *_judged(scene)) for scene in scenes]
+    found = [StripLayout(scene, parts) for scene, off, parts in judged if off < LARGEST_STRAY_LEFT]
     return min(found, key=lambda layout: layout.parts, default=None)
 
 
@@ -404,10 +401,9 @@ def _judged(scene: StripScene) -> tuple[float, float]:
     return (off, float(np.mean(parts))) if parts else (np.inf, 0.0)
 
 
-def factorise_strips(camera: Camera, space: CurvedSpace, grid: Grid, optics: Optics, turned: bool) -> StripOperator:
+def factorise_strips(scene: StripScene) -> StripOperator:
     """Return the weights of all voxels of a grid in strips."""
-    lit = lit_voxels(camera, space, grid).copy()
-    scene = strip_scene(camera, space, grid, optics, lit, turned)
+    camera, space, grid, optics = scene.camera, scene.space, scene.grid, scene.optics
     planes, lines, _ = scene.lit.shape
     blocks: list[Block] = []
     # Voxels that no rays are found for are taken out of what is lit.
@@ -417,12 +413,10 @@ def factorise_strips(camera: Camera, space: CurvedSpace, grid: Grid, optics: Opt
     columns = joined([each.columns for each in blocks], optics[scene.along], scene.cells[scene.along])
     rows = joined([each.rows for each in blocks], optics[scene.across], scene.cells[scene.across])
     mask = aperture_mask(columns.cells, rows.cells, camera.aperture_radius_mm)
-    where = (
-        [each.plane for each in blocks],
-        [len(each.rows.counts) for each in blocks],
-        [each.line for each in blocks],
-    )
-    places = Blocks(*(np.array(each, np.int64) for each in where))
+    where = [(each.plane, len(each.rows.counts), each.line) for each in blocks]
+    places = Blocks(*np.array(where, np.int64).reshape(-1, 3).T.copy())
+    turned = scene.across == 0
+    lit = scene.lit.swapaxes(1, 2) if turned else scene.lit
     operator = StripOperator(columns, rows, mask, places, scene.order, lit, turned, np.zeros(0))
     sample = sample_lit(camera, space, grid, lit, SAMPLE, np.random.default_rng(0))
     return replace(operator, misfit_l1=misfits_l1(operator, camera, space, grid, sample))
@@ -447,14 +441,12 @@ def voxel_centres(camera: Camera, grid: Grid, voxels: Integers) -> Floats:
     return np.stack(axes, axis=1)
 
 
-def misfits_l1(
-    operator: StripOperator, camera: Camera, space: CurvedSpace, grid: Grid, voxels: Integers, tiles: int = SAMPLE_TILES
-) -> Floats:
+def misfits_l1(operator: StripOperator, camera: Camera, space: CurvedSpace, grid: Grid, voxels: Integers) -> Floats:
     """Return how far the columns of voxels (n, 3) are from those of traced rays, in L1."""
     sides = camera.to_image_axes(np.asarray(grid.spacing_mm))
     found = []
     for voxel, centre in zip(voxels, voxel_centres(camera, grid, voxels), strict=True):
-        image = integrate_columns(camera, space, [centre], sides, tiles).image(0, operator.image_shape)
+        image = integrate_columns(camera, space, [centre], sides, SAMPLE_TILES).image(0, operator.image_shape)
         rows, columns, weights = operator.column(*voxel.tolist())
         image[rows, columns] -= weights
         found.append(np.abs(image).sum())

@@ -13,8 +13,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cache
-from itertools import product
 from typing import NamedTuple
 
 import numpy as np
@@ -24,8 +22,9 @@ from numpy.typing import NDArray
 from lfpiv_cli.arrays import Flags, Floats, Integers, Singles
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.curved_space import CurvedSpace
+from lfpiv_cli.optics.tracing import complete_exponents, polynomial_terms
 from lfpiv_cli.threads import share_out
-from lfpiv_cli.weights.axis import SMALLEST_SHARE, AxisWeights, FittedBending
+from lfpiv_cli.weights.axis import SMALLEST_SHARE, AxisWeights, Bending
 from lfpiv_cli.weights.lens_cells import AxisOptics, Cells
 from lfpiv_cli.weights.scene import places_on_array
 
@@ -196,10 +195,10 @@ class AxisFit:
         ends = []
         for end in (-1.0, 1.0):
             known[:, 3] = end
-            ends.append(_terms(known, self.exponents) @ self.coefficients_mm)
+            ends.append(polynomial_terms(known, self.exponents) @ self.coefficients_mm)
         return float(np.percentile(np.abs(ends[1] - ends[0]), 90.0))
 
-    def bending(self, depths_mm: Floats, beside_mm: Floats | None = None) -> FittedBending:
+    def bending(self, depths_mm: Floats, beside_mm: Floats | None = None) -> Bending:
         """Return the polynomials in own coordinate, from the middle, and crossing, at depths (planes, nodes).
 
         Where the coordinate along the other axis is known, at one place of it in each plane, (planes,).
@@ -218,7 +217,7 @@ class AxisFit:
             if beside_mm is not None:
                 part = part * factors[1][..., powers[3]]
             table[..., powers[0], powers[2]] += part
-        return FittedBending(table, np.array([half[self.axis], self.rays.radius_mm]), PIECES)
+        return Bending.fitted(table, np.array([half[self.axis], self.rays.radius_mm]), PIECES)
 
 
 def strip_rays(
@@ -258,21 +257,9 @@ def evenly_spread(count: int, dimensions: int) -> Floats:
     return np.asarray((0.5 + np.arange(1, count + 1)[:, np.newaxis] * steps) % 1.0)
 
 
-@cache
 def _exponents(degree: int, degree_beside: int | None) -> Integers:
     """Return the powers (terms, 3), with the other axis's coordinate (terms, 4), of polynomials of a degree."""
-    own = range(degree + 1)
-    powers = product(*[own] * 3, *([] if degree_beside is None else [range(min(degree_beside, degree) + 1)]))
-    return np.array([each for each in powers if sum(each) <= degree])
-
-
-def _terms(variables: Floats, exponents: Integers) -> Floats:
-    """Return each term (n, terms) of variables (n, k)."""
-    powers = variables[:, :, np.newaxis] ** np.arange(exponents.max() + 1)
-    terms = powers[:, 0, exponents[:, 0]]
-    for k in range(1, variables.shape[1]):
-        terms = terms * powers[:, k, exponents[:, k]]
-    return terms
+    return complete_exponents(degree, *3 * [degree], *([] if degree_beside is None else [min(degree_beside, degree)]))
 
 
 def fit_axis(rays: StripRays, axis: int, degree_beside: int | None) -> tuple[AxisFit, Floats]:
@@ -302,7 +289,7 @@ def fit_part(fit: AxisFit, left_mm: Floats, chosen: Flags) -> tuple[AxisFit, Flo
 
 def _solved(variables: Floats, exponents: Integers, place: Floats) -> tuple[Floats, Floats]:
     """Return the coefficients that follow places best, and what they leave."""
-    terms = _terms(variables, exponents)
+    terms = polynomial_terms(variables, exponents)
     normal = terms.T @ terms
     normal[np.diag_indices_from(normal)] += RIDGE * len(terms)
     coefficients = np.asarray(np.linalg.solve(normal, terms.T @ place), dtype=np.float64)
