@@ -35,8 +35,15 @@ from lfpiv_cli.weights.kernels import STRIP
 from lfpiv_cli.weights.model import Weights
 from lfpiv_cli.weights.quadrature import RayCount, count_rays, integrate_columns, sampling_error
 from lfpiv_cli.weights.scene import aimed_misfit_mm, curved_padding, lit_voxels, places_on_array
-from lfpiv_cli.weights.strip_fits import DEGREE_ALONG, evenly_spread, fit_axis, fit_part, mixed_shares, strip_rays
-from lfpiv_cli.weights.strips import StripOperator
+from lfpiv_cli.weights.strips import (
+    DEGREE_ALONG,
+    StripOperator,
+    evenly_spread,
+    fit_axis,
+    fit_part,
+    mixed_shares,
+    strip_rays,
+)
 
 VOXEL = (0.1, 0.1, 0.1)
 # Tiles across the aperture: with as many a column's own error is far below what chance makes of a count.

@@ -40,7 +40,6 @@ from lfpiv_cli.robust import MAD_TO_SIGMA
 # coincide, beta is -M, and the distance of that plane is L / |M| = F_m (1/P - 1/M). One board alone cannot tell it;
 # of several, the scale of the crossings does not matter.
 
-
 # Two make a line whatever they are.
 FEWEST_BOARDS = 3
 # What all dots of a board have in common does not show in their scatter: rendered ones were shown up to this share too

@@ -35,7 +35,6 @@ from lfpiv_cli.robust import MAD_TO_SIGMA
 #
 # Axes: (column, row); image heights over that of the sensor's corners.
 
-
 # Lens images of an ideal camera differ by 0.1 to 0.3 %. With a twentieth of the aperture cut off in the corners places
 # erred by four stated errors, with a fifth a sixth of the tracers was found; with microlenses 1.2 % further from the
 # sensor there depths erred by two, with 2.9 % by three. Of photographs one differs by 1.0 % from side to side.
@@ -153,7 +152,6 @@ def _fit(terms: Floats, values: Floats) -> list[Fitted]:
 # white images, two of them through microscopes, the residual of the lattice is 0.05 to 1 % of the pitch, nine in ten
 # lens images differ from their neighbours by less than 0.2 to 4 %, and 91 to 98 % of the lens images are found; of
 # pictures of scenes it is 1 to 13 %, 12 to 17 %, and 3 to 89 %.
-
 
 # Shares of the pitch: twice the worst white image's, and half of what pictures of scenes leave at their worst.
 LARGE_RESIDUAL, LARGEST_RESIDUAL = 0.02, 0.06

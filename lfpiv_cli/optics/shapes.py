@@ -75,6 +75,12 @@ def unit(direction: Sequence[float], name: str) -> Vector:
     return direction[0] / length, direction[1] / length, direction[2] / length
 
 
+def vector(values: Floats) -> Vector:
+    """Return a vector of an array (3,)."""
+    x, y, z = values.tolist()
+    return x, y, z
+
+
 @njit(cache=True, **COUNT_NO_REFERENCES)
 def dot(a: Vector, b: Vector) -> float:
     """Return the scalar product."""
@@ -130,19 +136,16 @@ class RigidMotion:
 
     def point(self, point_mm: Sequence[float]) -> Vector:
         """Return where one point is moved to."""
-        x, y, z = self.points(point_mm).tolist()
-        return x, y, z
+        return vector(self.points(point_mm))
 
     def direction(self, direction: Sequence[float]) -> Vector:
         """Return how one direction is turned."""
-        x, y, z = self.directions(direction).tolist()
-        return x, y, z
+        return vector(self.directions(direction))
 
     def then(self, later: RigidMotion) -> RigidMotion:
         """Return this motion followed by another, about this one's pivot."""
-        turn = (later._rotation * self._rotation).as_rotvec().tolist()
-        shift = (later.points(self.points(self.pivot_mm)) - np.asarray(self.pivot_mm)).tolist()
-        return RigidMotion((shift[0], shift[1], shift[2]), (turn[0], turn[1], turn[2]), self.pivot_mm)
+        shift = later.points(self.points(self.pivot_mm)) - np.asarray(self.pivot_mm)
+        return RigidMotion(vector(shift), vector((later._rotation * self._rotation).as_rotvec()), self.pivot_mm)
 
     @property
     def _rotation(self) -> Rotation:
@@ -156,7 +159,6 @@ class RigidMotion:
 # z_x and z_y, the normal away from the camera is (-z_x, -z_y, 1) / sqrt(1 + z_x^2 + z_y^2).
 #
 # `Reliefs` are in image axes.
-
 
 # Of a cubic spline along each axis whose ends are as smooth as its middle.
 FEWEST_NODES = 4
@@ -355,8 +357,7 @@ class ScenePose:
     @property
     def motion(self) -> RigidMotion:
         """The motion from where the config has the scene."""
-        shift, turn, pivot = (each.tolist() for each in (self.shift_mm, np.deg2rad(self.turn_deg), self.pivot_mm))
-        return RigidMotion(tuple(shift), tuple(turn), tuple(pivot))
+        return RigidMotion(vector(self.shift_mm), vector(np.deg2rad(self.turn_deg)), vector(self.pivot_mm))
 
     def summary(self) -> dict[str, Any]:
         """Return the figures as plain lists, units in their names."""

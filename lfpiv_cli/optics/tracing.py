@@ -366,7 +366,6 @@ def slope_ratios(lateral2_mm2: Floats, nodes: Floats, factors: Floats) -> Floats
 # thin lens (Abbe's condition). Both are worst for points off the focal plane, or deep in the fluid; here they lie on
 # the axis.
 
-
 # Light that is further off falls into another pixel. The paper's channel and the sample are off by a tenth of this, its
 # simulation behind 134 mm of water by twice this.
 LARGEST_ERROR_PX = 0.5

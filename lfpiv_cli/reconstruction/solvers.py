@@ -119,9 +119,6 @@ def _guarded_inverse(sums: Singles) -> Singles:
 
 
 # Volumes to start from: uniform, or what the lines of sight allow.
-#
-# Axes: volumes [z, y, x], images [row, column], float32.
-
 
 # A voxel can be lit when this share of its weights lies on lit pixels or their neighbours. Noise and a voxel's width
 # cost some: of nine tenths, voxels as wide as a microlens keep so few that a twentieth more of the image is left
@@ -173,8 +170,7 @@ def _brightest(image: Image, sums: Normalisers) -> float:
 # What solvers do with whole images, in one pass over the pixels each.
 #
 # An image has more pixels than a small volume has voxels; array by array these passes cost more than its weights.
-#
-# Axes: images [row, column], float32. Pixels whose inverse row sum is 0 take no part.
+# Pixels whose inverse row sum is 0 take no part.
 
 
 def correction(image: Image, projection: Image, inverse_row_sum: Image) -> Image:

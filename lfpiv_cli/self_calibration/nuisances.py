@@ -24,7 +24,7 @@ from lfpiv_cli.arrays import Flags, Floats, Integers, Singles
 from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.curved_space import CurvedSpace
-from lfpiv_cli.optics.shapes import RigidMotion
+from lfpiv_cli.optics.shapes import RigidMotion, vector
 from lfpiv_cli.optics.surfaces import Cylinder, Faces
 from lfpiv_cli.particles.cells import rim_table
 from lfpiv_cli.particles.fitting import add_all, refine
@@ -42,16 +42,12 @@ from lfpiv_cli.threads import blocks, in_threads
 # Axes: world axes, z away from the camera from the nominal focal point; lengths in mm. `along` runs along the pipe,
 # `across` is square to it and to the optical axis, `away` square to both, away from the camera.
 
-
 # Where particles lie behind faces that are not where they were thought to be.
 #
 # What an image shows of a particle are its rays over the main lens; along image axis k their slopes are a straight
 # line, (X_k - place_k) / distance_k, and a small rest (see `particles.pencil`). Behind other faces the same rays
 # belong to another place: the one whose lines are closest to those of the first over the aperture's disc. As behind a
 # pipe both distances differ and a place has only one depth, something is left where the faces are wrong.
-#
-# Axes: image axes, z away from the camera from the nominal focal point, mm.
-
 
 # Gauss-Newton's iteration: faces that are shifted by 0.2 mm leave 1e-9 mm after four.
 NEWTON_STEPS = 5
@@ -175,7 +171,7 @@ class MovableScene:
         """Return the motion by unknowns (4,): mm across and away, rad towards across and away."""
         shift = values[ACROSS] * self.across + values[AWAY] * self.away
         turn = values[TILT_ACROSS] * self.away - values[TILT_AWAY] * self.across
-        return RigidMotion(_vector(shift), _vector(turn), _vector(self.pivot_mm))
+        return RigidMotion(vector(shift), vector(turn), vector(self.pivot_mm))
 
     def moved(self, values: Floats) -> CurvedSpace:
         """Return the scene moved by unknowns (4,).
@@ -201,11 +197,6 @@ class MovableScene:
     def on_axis(self, along_mm: Floats, values: Floats) -> Floats:
         """Return the points (n, 3), world axes, of the moved pipe's axis at places (n,) along it."""
         return self.motion(values).points(self.pivot_mm) + np.outer(along_mm, self.frame(values)[0])
-
-
-def _vector(values: Floats) -> tuple[float, float, float]:
-    x, y, z = values.tolist()
-    return x, y, z
 
 
 # What the images of particles tell of camera, particles and scene.

@@ -233,7 +233,6 @@ def _density(depth: Floats, parameters: Floats, edge: Floats, stray: float, sear
 #
 # Axes: the pipe's frame (along, across, away), see `nuisances.MovableScene`; lengths in mm.
 
-
 # The ring begins at this share of the radius: it holds half of the section, in which seeding changes evenly.
 RING_FROM = 0.7
 # Fewer particles in the ring leave gaps that pass for the wall.

@@ -22,7 +22,6 @@ from lfpiv_cli.threads import share_out
 #
 # Axes: one image axis at a time (columns or rows), in mm about the optical axis.
 
-
 # Width given to a patch that lies outside the aperture, in radii: small beside the patch of a whole pixel (a tenth).
 SMALLEST_PATCH = 1e-3
 
@@ -200,7 +199,6 @@ def shared_rectangle(
 # of its square (pi/4), these shares turn the weights of the square aperture into those of the disc.
 #
 # Axes: patches are intervals of X (columns) and Y (rows) on the main lens, in mm about the axis.
-
 
 DISC_SHARE_OF_SQUARE = np.pi / 4.0
 

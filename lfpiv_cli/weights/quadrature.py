@@ -295,9 +295,6 @@ def _ramp(t: float, width: float) -> float:
 # Random points of the voxel each send random rays through the aperture; the share of the rays that strike a pixel is
 # its weight. Rays follow `optics.tracing` in every detail: any lattice, distortion and refraction. A count of n rays
 # over k pixels is off by about sqrt(2 k / (pi n)) in L1; more rays of few points do not make up for the points.
-#
-# Axes: image axes (x along the columns), mm, z away from the camera from the nominal focal point.
-
 
 # Points are counted in this many parts side by side, each into an image of its own.
 PARTS = 8

@@ -3,7 +3,8 @@
 Any lattice, any refraction, or rays as a polynomial has them. Behind curved faces some rays are traced from each point,
 and a polynomial through them tells the others.
 
-Axes: everything here is in image axes (x along the columns), mm, z away from the camera from the nominal focal point.
+Axes: everything but grids is in image axes (x along the columns), mm, z away from the camera from the nominal focal
+point.
 """
 
 from __future__ import annotations
@@ -31,9 +32,6 @@ from lfpiv_cli.threads import share_out
 from lfpiv_cli.weights.lens_cells import disc_area_below, neighbours
 
 # Where rays behind curved faces meet the array, and which voxels are seen at all.
-#
-# Axes: image axes (x along the columns), mm, z away from the camera from the nominal focal point.
-
 
 # Rays by which a voxel is judged to lie in the fluid and to be seen through the whole aperture: the middle and the rim.
 RIM = np.array([[0.0, 0.0], [1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
@@ -302,10 +300,6 @@ def on_sensor(camera: KernelCamera, ideal: float, crossing: float, place: float,
 
 
 # How far light spreads behind curved faces, and how well rays made for single voxels follow the traced ones.
-#
-# Axes: image axes (x along the columns), mm, z away from the camera from the nominal focal point; grids in world
-# axes.
-
 
 # Places along each axis of a volume at which the spread is looked at: it is largest at the volume's faces.
 SAMPLES = 5

@@ -26,10 +26,11 @@ from lfpiv_cli.weights.kernels import PLACES, SLAB, STRIP, Blocks
 from lfpiv_cli.weights.lens_cells import Cells, Optics, aperture_mask, micro_image_cells
 from lfpiv_cli.weights.quadrature import integrate_columns
 from lfpiv_cli.weights.scene import lit_voxels, places_on_array
-from lfpiv_cli.weights.strip_fits import (
+from lfpiv_cli.weights.strips import (
     DEGREE_ALONG,
     AxisFit,
     Factor,
+    StripOperator,
     StripRays,
     evenly_spread,
     fit_axis,
@@ -39,7 +40,6 @@ from lfpiv_cli.weights.strip_fits import (
     strip_rays,
     through_lines,
 )
-from lfpiv_cli.weights.strips import StripOperator
 
 # Parts of the aperture, side by side: by those along the strips column cells are sorted, so that those of a tile see
 # the same and light through one part comes from some of the tiles only; of those across, blocks have neighbouring ones.
@@ -339,7 +339,6 @@ def _factors_across(
 #
 # Axes: grids in world axes, z away from the camera from the nominal focal point.
 
-
 # Share of the light that may go astray with as many parts as there can be, by each axis; where more does, rays do not
 # separate even in strips.
 LARGEST_STRAY_LEFT = 0.04
@@ -419,7 +418,14 @@ def factorise_strips(scene: StripScene) -> StripOperator:
     lit = scene.lit.swapaxes(1, 2) if turned else scene.lit
     operator = StripOperator(columns, rows, mask, places, scene.order, lit, turned, np.zeros(0))
     sample = sample_lit(camera, space, grid, lit, SAMPLE, np.random.default_rng(0))
-    return replace(operator, misfit_l1=misfits_l1(operator, camera, space, grid, sample))
+    # How far columns of some voxels are from those of traced rays.
+    sides, misfits = camera.to_image_axes(np.asarray(grid.spacing_mm)), []
+    for voxel, centre in zip(sample, voxel_centres(camera, grid, sample), strict=True):
+        image = integrate_columns(camera, space, [centre], sides, SAMPLE_TILES).image(0, operator.image_shape)
+        rows_lit, columns_lit, weights = operator.column(*voxel.tolist())
+        image[rows_lit, columns_lit] -= weights
+        misfits.append(np.abs(image).sum())
+    return replace(operator, misfit_l1=np.array(misfits))
 
 
 def sample_lit(
@@ -439,15 +445,3 @@ def voxel_centres(camera: Camera, grid: Grid, voxels: Integers) -> Floats:
     first, second = (0, 1) if camera.column_axis == "x" else (1, 0)
     axes = (grid.axis_mm(first)[voxels[:, 2]], grid.axis_mm(second)[voxels[:, 1]], grid.axis_mm(2)[voxels[:, 0]])
     return np.stack(axes, axis=1)
-
-
-def misfits_l1(operator: StripOperator, camera: Camera, space: CurvedSpace, grid: Grid, voxels: Integers) -> Floats:
-    """Return how far the columns of voxels (n, 3) are from those of traced rays, in L1."""
-    sides = camera.to_image_axes(np.asarray(grid.spacing_mm))
-    found = []
-    for voxel, centre in zip(voxels, voxel_centres(camera, grid, voxels), strict=True):
-        image = integrate_columns(camera, space, [centre], sides, SAMPLE_TILES).image(0, operator.image_shape)
-        rows, columns, weights = operator.column(*voxel.tolist())
-        image[rows, columns] -= weights
-        found.append(np.abs(image).sum())
-    return np.array(found)
