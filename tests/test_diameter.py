@@ -203,15 +203,20 @@ def test_images_that_contradict_each_other_are_told() -> None:
 
 
 def test_the_two_images_of_a_pair_are_looked_at(monkeypatch: pytest.MonkeyPatch) -> None:
-    squares = iter([0.25, 0.36, 0.49])
+    """The second search begins with what the first one showed."""
+    squares, begun = iter([0.25, 0.36, 0.49]), []
     enough = np.full(10, 0.01)
-    monkeypatch.setattr(
-        "lfpiv_cli.particles.diameter.measured_sizes", lambda _: Sizes(next(squares) + 0 * enough, enough)
-    )
+
+    def measured(_: object, diameter: float | None) -> Sizes:
+        begun.append(diameter)
+        return Sizes(next(squares) + 0 * enough, enough)
+
+    monkeypatch.setattr("lfpiv_cli.particles.diameter.measured_sizes", measured)
     found = diameter_by([None, None, None])  # type: ignore[list-item]
     assert found is not None
     assert [each.lenses for each in found.frames] == pytest.approx([0.5, 0.6])
     assert found.tracers == 20
+    assert begun == [None, pytest.approx(0.5)]
 
 
 def test_files_state_an_error_where_the_diameter_is_by_the_images() -> None:

@@ -26,14 +26,13 @@ from numba import njit
 from numpy.typing import NDArray
 
 from lfpiv_cli.particles.diffusion import NO_FORMS, Forms, Together, forms_of, together_of
-from lfpiv_cli.particles.fitting import fit_from, judge
+from lfpiv_cli.particles.fitting import Choice, begin_at, fit_best, judge
 from lfpiv_cli.particles.least_squares import (
     SMALLEST_GAIN,
     UNKNOWNS,
     Effort,
     Observation,
     add_light,
-    copy_rows,
     lit_by,
     observation_of,
     respond_all,
@@ -162,7 +161,8 @@ def diameter_by(
     """
     frames: list[Sizes] = []
     for task in tasks:
-        frames.append(measured_sizes(task))
+        before = diameter_of(frames)
+        frames.append(measured_sizes(task, None if before is None else before.lenses))
         # The two images of a pair must agree.
         if len(frames) >= FEWEST_FRAMES and sum(sizes.square.size for sizes in frames) >= ENOUGH:
             break
@@ -197,8 +197,11 @@ def diameter_of(frames: Sequence[Sizes]) -> Diameter | None:
     return Diameter(diameter, float(np.hypot(spread / LIMIT_SIGMAS, model)), int(square.size))
 
 
-def measured_sizes(task: Task) -> Sizes:
-    """Return what the tracers of an image show of their sizes; `task` may be of any size."""
+def measured_sizes(task: Task, diameter: float | None = None) -> Sizes:
+    """Return what the tracers of an image show of their sizes; `task` may be of any size.
+
+    Where a `diameter` is known by another image the search begins with it; it may still lead to another one.
+    """
     candidates, light = candidates_of(task, blank(task), ROUNDS[0].iterations, None)
     region = Region(np.zeros(2), 0.0)
     if len(candidates):
@@ -212,6 +215,10 @@ def measured_sizes(task: Task) -> Sizes:
     bright = candidates[seen > WELL_SEEN, 3]
     typical = of_half_the_sum(bright) if bright.size else 0.0
     state = replace(state, typical_light=typical, noise=noise_with(task, typical))
+    if diameter is not None:
+        sizes = _settled_sizes(Sought(task, state, candidates, region), diameter, SEARCH)
+        if sizes.square.size:
+            return sizes
     diameter, apart = _first_diameter(task, state, _apart(task, state, candidates))
     if not len(apart):
         return NO_SIZES
@@ -483,7 +490,7 @@ def _fitted(
     tracers : (n, 4) where fits begin
     depths_mm : (n, k) their depths
     """
-    change, fitted, starts = np.zeros(len(tracers)), tracers.copy(), np.ascontiguousarray(depths_mm)
+    change, fitted, starts = np.zeros(len(tracers)), tracers.copy(), np.clip(depths_mm, *observation.depths_mm)
 
     def work(numbers: NDArray[np.int64]) -> None:
         _fit_each(observation, sized, tracers, numbers, starts, change, fitted)
@@ -506,15 +513,13 @@ def _fit_each(
     """Do the work of `_fitted` for the tracers of a tile."""
     residual = observation.residual
     own, responses = room_for(1, observation.capacity, 0), room_for(1, sized.capacity, 0)
-    trial, prior = np.empty((1, UNKNOWNS)), np.zeros((1, 2 * UNKNOWNS))
+    starts, prior = np.empty((depths_mm.shape[1], 1, UNKNOWNS)), np.zeros((1, 2 * UNKNOWNS))
+    effort = Effort(STEPS, SMALLEST_GAIN)
+    choice = Choice(effort, effort, len(starts), 0.0, np.inf)
     for number in numbers:
         respond_all(observation.optics, tracers[number : number + 1], own)
         pixels, values = lit_by(own, 0)
         add_light(pixels, values, tracers[number, 3], residual)
-        for depth in depths_mm[number]:
-            depth = min(max(depth, sized.low_mm), sized.high_mm)
-            gained = fit_from(sized, tracers[number], prior, depth, trial, responses, Effort(STEPS, SMALLEST_GAIN))
-            if gained < change[number]:
-                change[number] = gained
-                copy_rows(trial, fitted[number : number + 1])
+        begin_at(sized.optics, tracers[number], depths_mm[number], starts)
+        change[number] = fit_best(sized, starts, prior, responses, choice, (0.0, 0.0), fitted[number : number + 1])
         add_light(pixels, values, -tracers[number, 3], residual)

@@ -43,6 +43,8 @@ START_DEPTHS = np.array([-0.4, 0.0, 0.4]) / 1.064
 FIRST_STEPS = 3
 CANDIDATE_STEPS = 12
 SWEEP_STEPS = 4
+# Of starts whose light is the best one there.
+UNKNOWN_LIGHT = -1.0
 # A particle claims its light where at least this share of it is found (the rest may be noise and neighbours).
 CLAIM = 0.7
 
@@ -90,6 +92,87 @@ def refine(
     return fit_again(observation, particles, every, Effort(SWEEP_STEPS, enough), prior=prior).gain
 
 
+class Choice(NamedTuple):
+    """How the best of several places where a fit can begin is found.
+
+    Which place is right shows long before a fit has ended.
+
+    Attributes
+    ----------
+    first : from each place
+    then : from where that led, for the best ones
+    finalists : how many these are
+    faintest, brightest : light of each particle that is fitted
+    """
+
+    first: Effort
+    then: Effort
+    finalists: int
+    faintest: float
+    brightest: float
+
+
+NOWHERE_ELSE = Choice(Effort(0, 0.0), Effort(0, 0.0), 0, 0.0, np.inf)
+
+
+@njit(cache=True)
+def begin_at(view: View, particle: Floats, depths_mm: Floats, starts: Floats) -> None:
+    """Fill in starts (n, 1, 4) at depths (n,) of a particle's line of sight; their light is still to be found."""
+    for n in range(depths_mm.size):
+        depth = depths_mm[n]
+        starts[n, 0, 2], starts[n, 0, 3] = depth, UNKNOWN_LIGHT
+        if not np.isnan(depth):
+            starts[n, 0, 0], starts[n, 0, 1] = on_line_of_sight(view, particle[0], particle[1], particle[2], depth)
+
+
+@njit(cache=True)
+def fit_best(
+    observation: Observation,
+    starts: Floats,
+    prior: Floats,
+    responses: Responses,
+    choice: Choice,
+    limits: tuple[float, float],
+    best: Floats,
+) -> float:
+    """Fit one particle or two from several starts; fill in the best fit.
+
+    Parameters
+    ----------
+    starts : (n, k, 4) where fits begin, worked on; with `UNKNOWN_LIGHT` the best one there is taken, depths that are
+        NaN are left out
+    prior : (k, 8) see `least_squares.fit`
+    limits : what a start must add to chi-squared at most to be followed, and what the best must stay below
+    best : (k, 4) filled where a fit does
+
+    Returns
+    -------
+    what the best adds to chi-squared, the second of the limits where none is better
+    """
+    changes, view = np.full(len(starts), np.inf), observation.optics
+    promising, lowest = limits
+    for n in range(len(starts)):
+        if np.isnan(starts[n, 0, 2]):
+            continue
+        respond_all(view, starts[n], responses)
+        if starts[n, 0, 3] == UNKNOWN_LIGHT:
+            pixels, values = lit_by(responses, 0)
+            starts[n, 0, 3] = best_light(pixels, values, observation.residual, observation.weight)
+        changes[n] = fit(observation, starts[n], prior, responses, choice.first)
+    for _ in range(min(choice.finalists, len(starts))):
+        chosen = np.argmin(changes)
+        if changes[chosen] > promising:
+            break
+        changes[chosen] = np.inf
+        respond_all(view, starts[chosen], responses)
+        change = fit(observation, starts[chosen], prior, responses, choice.then)
+        light = starts[chosen, :, 3]
+        if change < lowest and choice.faintest <= light.min() and light.max() < choice.brightest:
+            lowest = change
+            copy_rows(starts[chosen], best)
+    return lowest
+
+
 class Refitted(NamedTuple):
     """What came of fits of particles that were known.
 
@@ -109,7 +192,8 @@ def fit_again(
     chosen: NDArray[np.bool_],
     effort: Effort,
     depths_mm: Floats | None = None,
-    least: tuple[float, float] = (0.0, 0.0),
+    choice: Choice = NOWHERE_ELSE,
+    gain: float = 0.0,
     prior: Floats | None = None,
 ) -> Refitted:
     """Fit the chosen ones of particles (n, 4) in place, from where they are and from other depths.
@@ -119,7 +203,8 @@ def fit_again(
     Parameters
     ----------
     depths_mm : (n, k) where else to begin, NaN for nowhere; default: nowhere
-    least : what another depth must gain in chi-squared, and the light that a particle must have there
+    choice : among these
+    gain : what another depth must gain in chi-squared
     prior : (n, 8) what is expected of the particles; default: nothing
     """
     expected = nothing_expected(len(particles)) if prior is None else prior
@@ -127,7 +212,7 @@ def fit_again(
     refitted = Refitted(np.zeros(len(particles), np.bool_), np.zeros(len(particles)))
 
     def work(numbers: NDArray[np.int64]) -> None:
-        _fit_again(observation, particles, expected, numbers[chosen[numbers]], effort, depths, least, refitted)
+        _fit_again(observation, particles, expected, numbers[chosen[numbers]], effort, depths, (choice, gain), refitted)
 
     over_tiles(work, observation.optics, particles, observation.depths_mm)
     return refitted
@@ -141,13 +226,13 @@ def _fit_again(
     numbers: NDArray[np.int64],
     effort: Effort,
     depths: Floats,
-    least: tuple[float, float],
+    elsewhere: tuple[Choice, float],
     refitted: Refitted,
 ) -> None:
     """Do the work of `fit_again` for the particles of a tile."""
     view, residual = observation.optics, observation.residual
     responses = room_for(1, observation.capacity, 0)
-    trial, best = np.empty((1, UNKNOWNS)), np.empty((1, UNKNOWNS))
+    starts, best = np.empty((depths.shape[1], 1, UNKNOWNS)), np.empty((1, UNKNOWNS))
     for number in numbers:
         copy_rows(particles[number : number + 1], best)
         expected = prior[number : number + 1]
@@ -156,15 +241,12 @@ def _fit_again(
         add_light(pixels, values, best[0, 3], residual)
         before = change_by(pixels, values, best[0, 3], residual, observation.weight) + surprise(best, expected)
         after = fit(observation, best, expected, responses, effort)
-        lowest = after - least[0]
-        for depth in depths[number]:
-            if np.isnan(depth):
-                continue
-            change = fit_from(observation, particles[number], expected, depth, trial, responses, effort)
-            if change < lowest and trial[0, 3] >= least[1]:
-                lowest = change
+        if depths.shape[1] > 0:
+            lowest = after - elsewhere[1]
+            begin_at(view, particles[number], depths[number], starts)
+            change = fit_best(observation, starts, expected, responses, elsewhere[0], (np.inf, lowest), best)
+            if change < lowest:
                 after = change
-                copy_rows(trial, best)
                 refitted.moved[number] = True
         refitted.gain[number] = before - after
         copy_rows(best, particles[number : number + 1])
@@ -172,29 +254,6 @@ def _fit_again(
             respond_all(view, best, responses)
         pixels, values = lit_by(responses, 0)
         add_light(pixels, values, -best[0, 3], residual)
-
-
-# Inlined: one function less to compile the whole fit into.
-@njit(cache=True, inline="always")
-def fit_from(
-    observation: Observation,
-    particle: Floats,
-    prior: Floats,
-    depth: float,
-    trial: Floats,
-    responses: Responses,
-    effort: Effort,
-) -> float:
-    """Fit `trial` (1, 4), a particle at another depth of its line of sight; return what it adds to chi-squared.
-
-    It begins with the best light there.
-    """
-    trial[0, 0], trial[0, 1] = on_line_of_sight(observation.optics, particle[0], particle[1], particle[2], depth)
-    trial[0, 2] = depth
-    respond_all(observation.optics, trial, responses)
-    pixels, values = lit_by(responses, 0)
-    trial[0, 3] = best_light(pixels, values, observation.residual, observation.weight)
-    return fit(observation, trial, prior, responses, effort)
 
 
 def nothing_expected(count: int) -> Floats:
@@ -222,12 +281,12 @@ def accept(observation: Observation, candidates: Floats, least: Least) -> NDArra
     """Fit candidates (n, 4) in place, one after the other; return which ones stay, their light off the residual."""
     accepted = np.zeros(len(candidates), np.bool_)
 
-    efforts = Effort(FIRST_STEPS, CHOICE_GAIN), Effort(CANDIDATE_STEPS, CHOICE_GAIN)
+    choice = Choice(Effort(FIRST_STEPS, CHOICE_GAIN), Effort(CANDIDATE_STEPS, CHOICE_GAIN), 1, least.light, np.inf)
     depths = candidates[:, 2:3] + START_DEPTHS * observation.optics.scale.depth_mm
     depths = np.clip(depths, observation.low_mm, observation.high_mm)
 
     def work(numbers: NDArray[np.int64]) -> None:
-        _accept(observation, candidates, numbers, efforts, depths, least, accepted)
+        _accept(observation, candidates, numbers, choice, depths, least, accepted)
 
     over_tiles(work, observation.optics, candidates, observation.depths_mm)
     return accepted
@@ -238,28 +297,20 @@ def _accept(
     observation: Observation,
     candidates: Floats,
     numbers: NDArray[np.int64],
-    efforts: tuple[Effort, Effort],
+    choice: Choice,
     depths: Floats,
     least: Least,
     accepted: NDArray[np.bool_],
 ) -> None:
-    """Do the work of `accept` for the candidates of a tile; `efforts` are for each depth and for the best one."""
+    """Do the work of `accept` for the candidates of a tile."""
     residual, weight = observation.residual, observation.weight
-    responses = room_for(1, observation.capacity, 0)
-    trial, best = np.empty((1, UNKNOWNS)), np.empty((1, UNKNOWNS))
-    prior = np.zeros((1, 2 * UNKNOWNS))
+    responses, prior = room_for(1, observation.capacity, 0), np.zeros((1, 2 * UNKNOWNS))
+    starts, best = np.empty((depths.shape[1], 1, UNKNOWNS)), np.empty((1, UNKNOWNS))
     for number in numbers:
-        lowest = 0.0
-        for depth in depths[number]:
-            change = fit_from(observation, candidates[number], prior, depth, trial, responses, efforts[0])
-            if change < lowest:
-                lowest = change
-                copy_rows(trial, best)
-        if lowest == 0.0:
+        begin_at(observation.optics, candidates[number], depths[number], starts)
+        if fit_best(observation, starts, prior, responses, choice, (0.0, -least.gain), best) >= -least.gain:
             continue
         respond_all(observation.optics, best, responses)
-        if fit(observation, best, prior, responses, efforts[1]) > -least.gain or best[0, 3] < least.light:
-            continue
         pixels, values = lit_by(responses, 0)
         if seen_share(pixels, values, weight) <= least.seen:
             continue

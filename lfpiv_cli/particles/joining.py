@@ -26,7 +26,7 @@ from scipy import ndimage
 from scipy.spatial import KDTree
 
 from lfpiv_cli.arrays import Floats
-from lfpiv_cli.particles.fitting import fit_from, nothing_expected
+from lfpiv_cli.particles.fitting import Choice, begin_at, fit_best, nothing_expected
 from lfpiv_cli.particles.least_squares import (
     CHOICE_GAIN,
     UNKNOWNS,
@@ -147,6 +147,8 @@ LARGEST_LOSS = 25.0
 # One in twenty particles is brighter than what two may be joined to.
 BRIGHTEST_PERCENTILE = 95.0
 STEPS = 12
+# The light of a particle that is there at all, counts.
+LEAST_LIGHT = 1e-9
 
 
 def with_twins_joined(task: Task, state: State, unexplained: float, chi2: Floats) -> State:
@@ -220,8 +222,9 @@ def _join(
 ) -> None:
     """Do the work of `join` for the pairs of a tile; `free` are particles that no pair has taken yet."""
     view, residual, weight = observation.optics, observation.residual, observation.weight
-    responses, effort = room_for(1, observation.capacity, 0), Effort(STEPS, CHOICE_GAIN)
-    trial, best, prior = np.empty((1, UNKNOWNS)), np.empty((1, UNKNOWNS)), np.zeros((1, 2 * UNKNOWNS))
+    responses, prior = room_for(1, observation.capacity, 0), np.zeros((1, 2 * UNKNOWNS))
+    depths, starts, best = np.empty(3), np.empty((3, 1, UNKNOWNS)), np.empty((1, UNKNOWNS))
+    effort = Effort(STEPS, CHOICE_GAIN)
     for number in numbers:
         first, second = pairs[number]
         if not (free[first] and free[second]):
@@ -232,12 +235,11 @@ def _join(
             pixels, values = lit_by(responses, 0)
             add_light(pixels, values, particles[member, 3], residual)
             two += change_by(pixels, values, particles[member, 3], residual, weight)
-        lowest = two + largest_loss[number]
-        for depth in (middle[number, 2], particles[first, 2], particles[second, 2]):
-            change = fit_from(observation, middle[number], prior, depth, trial, responses, effort)
-            if change < lowest and 0.0 < trial[0, 3] < brightest[number]:
-                lowest, joined[number] = change, True
-                copy_rows(trial, best)
+        depths[0], depths[1], depths[2] = middle[number, 2], particles[first, 2], particles[second, 2]
+        begin_at(view, middle[number], depths, starts)
+        choice = Choice(effort, effort, len(starts), LEAST_LIGHT, brightest[number])
+        limits = np.inf, two + largest_loss[number]
+        joined[number] = fit_best(observation, starts, prior, responses, choice, limits, best) < limits[1]
         if joined[number]:
             copy_rows(best, particles[first : first + 1])
             free[first] = free[second] = False

@@ -13,17 +13,16 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from lfpiv_cli.arrays import Floats
-from lfpiv_cli.particles.fitting import fit_again
+from lfpiv_cli.particles.fitting import Choice, fit_again, fit_best
 from lfpiv_cli.particles.least_squares import (
     CHOICE_GAIN,
     UNKNOWNS,
     Effort,
     Observation,
     add_light,
+    change_by,
     copy_rows,
-    fit,
     lit_by,
-    normal_equations,
     respond_all,
     room_for,
 )
@@ -52,7 +51,7 @@ STARTS = np.array(
     ]
 )
 # Steps from every start. The best ones are fitted on, so many steps at most, if they have by then gained this share of
-# what is asked for: which place is right shows long before a fit has ended.
+# what is asked for.
 FIRST_STEPS = 4
 FINALISTS = 2
 PAIR_STEPS = 12
@@ -73,11 +72,11 @@ def split(
     """
     partners = np.zeros_like(particles)
     places = footprint_px(observation.optics, *observation.depths_mm) * observation.optics.camera.columns
+    first, then = Effort(FIRST_STEPS, CHOICE_GAIN), Effort(PAIR_STEPS, CHOICE_GAIN)
+    choice = Choice(first, then, FINALISTS, smallest_light, np.inf)
 
     def work(numbers: NDArray[np.int64]) -> None:
-        least = (smallest_gain, smallest_light)
-        efforts = Effort(FIRST_STEPS, CHOICE_GAIN), Effort(PAIR_STEPS, CHOICE_GAIN)
-        _split(observation, particles, numbers[suspects[numbers]], places, efforts, least, partners)
+        _split(observation, particles, numbers[suspects[numbers]], places, choice, smallest_gain, partners)
 
     over_tiles(work, observation.optics, particles, observation.depths_mm)
     return partners
@@ -89,53 +88,31 @@ def _split(
     particles: Floats,
     numbers: NDArray[np.int64],
     places: int,
-    efforts: tuple[Effort, Effort],
-    least: tuple[float, float],
+    choice: Choice,
+    gain: float,
     partners: Floats,
 ) -> None:
-    """Do the work of `split` for suspects of a tile.
-
-    `efforts` are for every start and for the best ones; `least` is what two must gain, and the light of each.
-    """
+    """Do the work of `split` for suspects of a tile; `gain` is what two must lower chi-squared by."""
     view, residual, scale = observation.optics, observation.residual, observation.optics.scale
-    responses = room_for(2, observation.capacity, places)
-    matrix, right = np.empty((UNKNOWNS, UNKNOWNS)), np.empty(UNKNOWNS)
-    pair, best = np.empty((2, UNKNOWNS)), np.empty((2, UNKNOWNS))
-    prior = np.zeros((2, 2 * UNKNOWNS))
-    begun, changes = np.empty((len(STARTS), 2, UNKNOWNS)), np.empty(len(STARTS))
+    responses, prior = room_for(2, observation.capacity, places), np.zeros((2, 2 * UNKNOWNS))
+    best, starts = np.empty((2, UNKNOWNS)), np.empty((len(STARTS), 2, UNKNOWNS))
     for number in numbers:
         one = particles[number : number + 1]
         light = one[0, 3]
         respond_all(view, one, responses)
         pixels, values = lit_by(responses, 0)
         add_light(pixels, values, light, residual)
-        single = normal_equations(pixels, values, light, residual, observation.weight, responses.picked, matrix, right)
-        lowest = single - least[0]
-        promising = single - FIRST_GAIN * least[0]
+        single = change_by(pixels, values, light, residual, observation.weight)
         for start, offset in enumerate(STARTS):
             for m in range(2):
-                sign = 1.0 - 2.0 * m
+                sign, pair = 1.0 - 2.0 * m, starts[start]
                 pair[m, 0] = one[0, 0] + sign * offset[0] * scale.lens_mm
                 pair[m, 1] = one[0, 1] + sign * offset[1] * scale.lens_mm
                 depth = one[0, 2] + sign * offset[2] * scale.depth_mm
                 pair[m, 2] = min(max(depth, observation.low_mm), observation.high_mm)
                 pair[m, 3] = 0.5 * light
-            respond_all(view, pair, responses)
-            changes[start] = fit(observation, pair, prior, responses, efforts[0])
-            copy_rows(pair, begun[start])
-        found = False
-        for _ in range(FINALISTS):
-            chosen = np.argmin(changes)
-            if changes[chosen] > promising:
-                break
-            changes[chosen] = np.inf
-            copy_rows(begun[chosen], pair)
-            respond_all(view, pair, responses)
-            change = fit(observation, pair, prior, responses, efforts[1])
-            if change < lowest and min(pair[0, 3], pair[1, 3]) >= least[1]:
-                lowest, found = change, True
-                copy_rows(pair, best)
-        if found:
+        limits = single - FIRST_GAIN * gain, single - gain
+        if fit_best(observation, starts, prior, responses, choice, limits, best) < limits[1]:
             copy_rows(best[:1], one)
             copy_rows(best[1:], partners[number : number + 1])
             respond_all(view, best, responses)
@@ -160,7 +137,8 @@ def _split(
 # Starts relative to the particle's depth, in depths over which light spreads by one lens (Table 2: 0.2 to 2 mm); its
 # mirrored depth is another.
 OTHER_DEPTHS = np.array([-2.0, -1.5, -1.0, -0.7, -0.4, -0.2, 0.2, 0.4, 0.7, 1.0, 1.5, 2.0]) / 1.064
-STEPS = 8
+# Steps from each of them, and from the best ones on.
+DEPTH_STEPS, STEPS = 8, 8
 
 
 def try_other_depths(
@@ -178,8 +156,9 @@ def try_other_depths(
     depth = particles[:, 2:3]
     starts = np.concatenate([depth + OTHER_DEPTHS * observation.optics.scale.depth_mm, -depth], axis=1)
     starts[(starts < observation.low_mm) | (starts > observation.high_mm)] = np.nan
-    effort, least = Effort(STEPS, CHOICE_GAIN), (smallest_gain, smallest_light)
-    return fit_again(observation, particles, suspects, effort, starts, least, prior).moved
+    first, then = Effort(DEPTH_STEPS, CHOICE_GAIN), Effort(STEPS, CHOICE_GAIN)
+    choice = Choice(first, then, FINALISTS, smallest_light, np.inf)
+    return fit_again(observation, particles, suspects, then, starts, choice, smallest_gain, prior).moved
 
 
 # Particles that fit worse than good ones by this factor are suspects.
