@@ -381,6 +381,9 @@ def test_few_links_are_told_where_particles_are_many(counts: tuple[int, int], li
         ({"tracks": 100, "expected_wrong_links": 4.9}, []),
         ({"tracks": 100, "expected_wrong_links": 5.1}, ["wrong-links"]),
         ({"tracks": 0, "expected_wrong_links": 0.0}, []),
+        ({"tracks": 100, "expected_wrong_links": 0.0, "light_b_over_a": 0.81}, []),
+        ({"tracks": 100, "expected_wrong_links": 0.0, "light_b_over_a": 0.79}, ["light-unequal"]),
+        ({"tracks": 100, "expected_wrong_links": 0.0, "light_b_over_a": 1.26}, ["light-unequal"]),
         # a track of five places has four links
         ({"tracks": 20, "tracked": 100, "expected_wrong_links": 3.9, "noise_over_stated": [1.3, 2.9, 1.0]}, []),
         ({"tracks": 20, "tracked": 100, "expected_wrong_links": 4.1, "noise_over_stated": None}, ["wrong-links"]),

@@ -37,6 +37,8 @@ FEW = FEWEST_OF_FIT + 2
 LEAST_LINKED = 0.5
 # The share of probably wrong links above which vectors of single tracks are in doubt.
 MOST_WRONG = 0.05
+# Pulses of one laser differ by less; where they do not, the fainter image has markedly larger errors.
+MOST_UNEQUAL = 1.25
 # Particles' places scatter by one to two stated errors about smooth paths; what is more is the flow's.
 LARGEST_NOISE = 3.0
 # Displacements of still particles differ from 0 by a standard error along one axis or another, by chance.
@@ -259,6 +261,11 @@ def doubt_notices(summary: Mapping[str, Any], name: str) -> list[Notice]:
         text = f"{wrong:.0%} of the links are probably wrong, by their alternatives"
         remedy = "a shorter time between the images, fewer tracers, or larger windows and correlate"
         notices.append(Notice("wrong-links", name, text, remedy, wrong, f"at most {MOST_WRONG:g}"))
+    light = summary.get("light_b_over_a", 1.0)
+    if max(light, 1.0 / light) > MOST_UNEQUAL:
+        text = f"particles of the second image are {light:.2f} times as bright as in the first: of unequal pulses"
+        remedy = "balance the energies of the two pulses, or the exposures: the fainter image has the larger errors"
+        notices.append(Notice("light-unequal", name, text, remedy, light, f"{1 / MOST_UNEQUAL:g} to {MOST_UNEQUAL:g}"))
     noise = summary.get("noise_over_stated")
     if noise is not None and max(noise) > LARGEST_NOISE:
         text = f"places lie {max(noise):.1f} times their stated errors off cubics in time, which velocities are of"

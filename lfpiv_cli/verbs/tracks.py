@@ -312,6 +312,9 @@ def tracked(
         "tracks": len(links.first),
         "expected_wrong_links": float(np.sum(1.0 - links.probability)),
     }
+    if len(links.first):
+        before, after = first.arrays["intensity"][links.first], second.arrays["intensity"][links.second]
+        summary["light_b_over_a"] = float(np.median(after / before))
     points = Points(path.middle_mm, arrays, reference, told, provenance)
     return Tracked(points, TRACKS_FORMAT, lambda: iter([path]), summary, settings)
 
