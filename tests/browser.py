@@ -90,10 +90,6 @@ class Browser:
         assert "exceptionDetails" not in found, found
         return found["result"].get("value")
 
-    def screenshot(self, target: Path) -> None:
-        """Write a picture of what is in view."""
-        target.write_bytes(base64.b64decode(self.ask("Page.captureScreenshot")["data"]))
-
     def print(self, target: Path) -> None:
         """Write the page as PDF."""
         target.write_bytes(base64.b64decode(self.ask("Page.printToPDF", printBackground=True)["data"]))

@@ -60,9 +60,8 @@ def write_cine(
     else:
         gap = 0 if tight else -columns * stack.dtype.itemsize % 4
         frames = [b"".join(row.tobytes() + bytes(gap) for row in frame[::-1]) for frame in stack]
-    bitmap = struct.pack(
-        "<IiiHHIIiiII", 40, columns, rows, 1, stored, {0: 0, 10: 256, 12: 1024}[packed], len(frames[0]), 0, 0, 0, 0
-    )
+    packing = {0: 0, 10: 256, 12: 1024}[packed]
+    bitmap = struct.pack("<IiiHHIIiiII", 40, columns, rows, 1, stored, packing, len(frames[0]), 0, 0, 0, 0)
     setup = bytearray(11_000)
     setup[140:144] = struct.pack("<2sH", b"ST", len(setup))
     setup[768:772] = struct.pack("<I", RATE_HZ)
@@ -78,21 +77,8 @@ def write_cine(
     first = places_at + count * struct.calcsize("<" + kind)
     wrapped = [struct.pack("<I", 8 + len(notes)) + notes + struct.pack("<I", len(f)) + f for f in frames]
     places = [first + sum(map(len, wrapped[:k])) for k in range(count)]
-    header = struct.pack(
-        "<2sHHHiIiIIIIQ",
-        b"CI",
-        44,
-        2 if filters else 0,
-        version,
-        -5,
-        100,
-        -5,
-        count,
-        44,
-        44 + len(bitmap),
-        places_at,
-        BEGIN_S << 32,
-    )
+    parts = (44, 44 + len(bitmap), places_at, BEGIN_S << 32)
+    header = struct.pack("<2sHHHiIiIIIIQ", b"CI", 44, 2 if filters else 0, version, -5, 100, -5, count, *parts)
     path.write_bytes(b"".join([header, bitmap, setup, blocks, struct.pack(f"<{count}{kind}", *places), *wrapped]))
 
 

@@ -24,17 +24,8 @@ from lfpiv_cli.optics.media import Media, Window
 from lfpiv_cli.reference import Reference
 from tests.commands import CONFIG, SAMPLE, sample_weights
 
-TABLE2 = Camera(
-    magnification=-1.0,
-    focal_length_mm=100.0,
-    aperture_mm=25.0,
-    microlens_focal_length_mm=0.8,
-    microlens_distance_mm=0.8,
-    lattice=Lattice.regular(0.1),
-    pixel_mm=0.0055,
-    columns=2352,
-    rows=1768,
-)
+# Magnification, focal length, aperture; microlenses' focal length and distance, their lattice; pixel, columns, rows.
+TABLE2 = Camera(-1.0, 100.0, 25.0, 0.8, 0.8, Lattice.regular(0.1), 0.0055, 2352, 1768)
 
 
 @pytest.fixture(params=["square", "hexagonal"])

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
+from lfpiv_cli.arrays import Flags, Floats
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media
@@ -19,9 +19,7 @@ from lfpiv_cli.weights.build import default_padding, factorise
 from lfpiv_cli.weights.model import Weights
 
 
-def task_with(
-    table2: Camera, water: Media, true: NDArray[np.float64], rng: np.random.Generator, noise: float = 6.0
-) -> Task:
+def task_with(table2: Camera, water: Media, true: Floats, rng: np.random.Generator, noise: float = 6.0) -> Task:
     """Return the task that a noisy image of particles sets; `noise` in counts."""
     camera = replace(table2, columns=500, rows=420)
     grid = Grid.centred((20, 16, 20), (0.1, 0.1, 0.1), (0.0, 0.0, 1.9))
@@ -35,7 +33,7 @@ def task_with(
     return task_of(shaped, view, weights, camera, normalisers(weights.padded), None)
 
 
-def found(particles: NDArray[np.float64], true: NDArray[np.float64]) -> NDArray[np.bool_]:
+def found(particles: Floats, true: Floats) -> Flags:
     """Return which true particles (n, 4) have one within 0.02 mm laterally and 0.1 mm in depth."""
     distance, _ = KDTree(particles[:, :3] / (0.02, 0.02, 0.1)).query(true[:, :3] / (0.02, 0.02, 0.1))
     return np.asarray(distance < 1.0)

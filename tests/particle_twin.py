@@ -17,6 +17,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.particles.cells import covered_share
 from lfpiv_cli.particles.micro_images import GAUSS_AT, GAUSS_WEIGHT, LONGEST, SMALLEST_SHARE
 from lfpiv_cli.particles.refraction import Bend, bend_of, displaced, is_seen
@@ -33,8 +34,6 @@ from lfpiv_cli.particles.response import (
     seen_moves,
 )
 from lfpiv_cli.particles.view import View
-
-Floats = NDArray[np.float64]
 
 # Rows of a profile: mean and slope of P, their derivatives by x and by z, the patch's middle, and how far from the
 # ball's middle the part of it is that is seen, times P.
@@ -222,59 +221,14 @@ def _join(view: View, projection: Projection, bend: Bend, lens: Lens, pixels: ND
     return count
 
 
-@njit(cache=True, nogil=True)
-def entries_of(view: View, particles: Floats, capacity: int) -> tuple[NDArray[np.int64], NDArray[np.int32], Floats]:
-    """Return the entries of particles (n, 3 or more) of unit light, one particle after another.
-
-    Returns
-    -------
-    counts : (n,) entries of each
-    pixels, values : as `respond` writes them
-    """
-    counts = np.zeros(particles.shape[0], np.int64)
-    pixels = np.empty(particles.shape[0] * capacity, np.int32)
-    values = np.empty((particles.shape[0] * capacity, VALUES))
-    end = 0
-    for n in range(particles.shape[0]):
-        x, y, z = particles[n, 0], particles[n, 1], particles[n, 2]
-        counts[n] = respond(view, x, y, z, pixels[end : end + capacity], values[end : end + capacity])
-        end += counts[n]
-    return counts, pixels[:end].copy(), values[:end].copy()
-
-
-@njit(cache=True)
 def respond_once(view: View, x: float, y: float, z: float, pixels: NDArray[np.int32], values: Floats) -> int:
     """Write the response of a particle of unit light with each pixel named once; return the number of pixels.
 
     The readable twin of `respond_rows`.
     """
     entries = respond(view, x, y, z, pixels, values)
-    if entries == 0:
-        return 0
-    top, bottom, left, right = view.camera.rows, 0, view.camera.columns, 0
-    for k in range(entries):
-        row, column = _row_and_column(pixels[k], view.camera.columns)
-        top, bottom, left, right = min(top, row), max(bottom, row), min(left, column), max(right, column)
-    place = np.zeros((bottom - top + 1, right - left + 1), np.int32)
-    count = 0
-    for k in range(entries):
-        row, column = _row_and_column(pixels[k], view.camera.columns)
-        at = place[row - top, column - left]
-        if at > 0:
-            for m in range(VALUES):
-                values[at - 1, m] += values[k, m]
-            continue
-        if count < k:
-            pixels[count] = pixels[k]
-            for m in range(VALUES):
-                values[count, m] = values[k, m]
-        count += 1
-        place[row - top, column - left] = count
-    return count
-
-
-@njit(cache=True)
-def _row_and_column(pixel: int, columns: int) -> tuple[int, int]:
-    """Return where a flat pixel lies, without a division of integers, which is slow."""
-    row = int((pixel + 0.5) / columns)
-    return row, pixel - row * columns
+    named, place = np.unique(pixels[:entries], return_inverse=True)
+    sums = np.zeros((named.size, VALUES))
+    np.add.at(sums, place, values[:entries])
+    pixels[: named.size], values[: named.size] = named, sums
+    return int(named.size)

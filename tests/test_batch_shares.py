@@ -53,7 +53,7 @@ def bytes_of(folder: Path | list[Path]) -> dict[str, bytes]:
 
 
 @pytest.mark.thorough
-def test_shards_together_give_what_one_command_gives(
+def test_shards_give_what_one_command_gives(
     weights: Path, frames: list[Path], volumes: list[Path], tmp_path: Path
 ) -> None:
     for number in (3, 1, 2):
@@ -177,7 +177,7 @@ def alone(weights: Path, frames: list[Path], output: Path, *options: object) -> 
 
 
 @pytest.mark.thorough
-def test_frames_of_a_folder_that_is_being_filled(
+def test_frames_that_come(
     weights: Path,
     frames: list[Path],
     tmp_path: Path,
@@ -202,9 +202,7 @@ def test_frames_of_a_folder_that_is_being_filled(
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("pairing", ["ab", "sequence"])
-def test_pairs_of_a_folder_that_is_being_filled(
-    pairing: str, volumes: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_pairs_that_come(pairing: str, volumes: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     named = [tmp_path / f"{1 + number // 2}{'ab'[number % 2]}.vtkhdf" for number in range(4)]
     for path, volume in zip(named, volumes, strict=False):
         path.write_bytes(volume.read_bytes())
@@ -232,9 +230,7 @@ def test_a_lost_frame_of_a_folder_that_is_being_filled_is_told_at_once(
     assert capsys.readouterr().err.count("2a.vtkhdf: the second frame of its pair is missing") == 1
 
 
-def test_what_does_not_come_is_told(
-    volumes: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, weights: Path
-) -> None:
+def test_what_stays_away(volumes: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, weights: Path) -> None:
     folder = Filling(tmp_path / "volumes", {1.0: volumes[0]})
     monkeypatch.setattr(listing, "time", folder)
     with pytest.raises(InputError, match="no other frame has come"):
@@ -261,7 +257,7 @@ ALONE, PAIRED = "reconstruct {weights} {folder}", "correlate {folder} --pairing 
         ("reconstruct {weights} {file}", "--watch takes folders"),
     ],
 )
-def test_what_does_not_go_with_a_folder_that_is_being_filled(
+def test_what_frames_that_come_exclude(
     weights: Path, frames: list[Path], tmp_path: Path, words: str, said: str
 ) -> None:
     command = words.format(weights=weights, folder=tmp_path, file=frames[0])
@@ -271,9 +267,7 @@ def test_what_does_not_go_with_a_folder_that_is_being_filled(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("options", [(), ("--pairing", "ab"), ("--background", "minimum:5")])
-def test_particles_of_shards_are_those_of_one_command(
-    weights: Path, frames: list[Path], options: tuple[str, ...], tmp_path: Path
-) -> None:
+def test_particles_of_shards(weights: Path, frames: list[Path], options: tuple[str, ...], tmp_path: Path) -> None:
     for share in ("1/1", "2/3", "1/3", "3/3"):
         folder, common = tmp_path / ("one" if share == "1/1" else "shards"), ("--solver", "particles", "--quiet")
         run("reconstruct", weights, *frames[:4], *common, *options, "--shard", share, "-o", folder)

@@ -1,4 +1,4 @@
-"""Batches through the real commands: what is skipped, what fails and is listed, and two workers at once."""
+"""Batches through the real commands: what is skipped, fails, is listed, is shared by two workers; and dry runs."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ import tifffile
 from lfpiv_cli.cli.options import Terminated
 from lfpiv_cli.errors import InputError, OutputError, OutputExistsError, PartialError, UsageError
 from lfpiv_cli.files import atomic, shares
-from lfpiv_cli.files.atomic import ignores_case
+from lfpiv_cli.files.atomic import EventLog, ignores_case
 from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, read_points
 from lfpiv_cli.files.shares import DEAD_AFTER_S, claim_path, claimed
 from lfpiv_cli.files.vtkhdf import open_volume, write_volume
@@ -291,9 +291,7 @@ STILLS = f"calibrate-snapshot '{CONFIG}' --white '{SAMPLE}/white.tif' --dark '{S
         f"refine-calibration '{CONFIG}' f0.tif --calibration z.h5 --picture c.h5 -o c.h5",
     ],
 )
-def test_outputs_of_one_name_are_refused_before_any_work(
-    weights, images, raw, pairs, tmp_path, monkeypatch, words
-) -> None:
+def test_outputs_of_one_name_are_refused_at_once(weights, images, raw, pairs, tmp_path, monkeypatch, words) -> None:
     monkeypatch.chdir(tmp_path)
     Path("other").mkdir()
     for name in ("other/f0.tif", "other/F0.tif", "other/run_0001.tif", "f0.vtkhdf", "f0_residual.tif"):
@@ -388,3 +386,96 @@ def test_frames_are_searched_by_pairs_and_whoever_makes_one_tells_the_tracers_si
     assert batch.order == [0, 2, 1, 3]
     told = batch.summary(Worked({0: stage.Outcome(0.1, 0, 5, size)}))
     assert told == told | size.summary()
+
+
+def test_a_dry_run_tells_and_writes_nothing(weights, images, tmp_path, capsys) -> None:
+    command = ("reconstruct", weights, *images, *QUICK, "-o", tmp_path / "out", "--failures", tmp_path / "failed.json")
+    before = stamps(tmp_path)
+    summary = told(capsys, *command, "--log", tmp_path / "log", "--dry-run")
+    assert stamps(tmp_path) == before
+    assert (summary["frames"], summary["to_make"], summary["skipped"], summary["unreadable"]) == (3, 3, 0, 0)
+    assert summary["would_make"] == [str(tmp_path / "out" / f"f{number}.vtkhdf") for number in range(3)]
+    assert (summary["seconds"], summary["seconds_by"]) == (None, None)
+    assert summary["disk_by"] == "at most, uncompressed"
+    run(*command)
+    written = sum(path.stat().st_size for path in (tmp_path / "out").iterdir()) / 1e6
+    assert written < summary["disk_mb"] < 10.0 * written
+
+
+@pytest.mark.thorough
+def test_a_dry_run_believes_what_is_there_and_the_log(weights, images, tmp_path, capsys) -> None:
+    command = ("reconstruct", weights, *images, *QUICK, "-o", tmp_path / "out", "--log", tmp_path / "log", "--resume")
+    run(*command)
+    victim = tmp_path / "out" / "f1.vtkhdf"
+    size = victim.stat().st_size
+    victim.unlink()
+    before = [json.loads(line) for line in (tmp_path / "log").read_text().splitlines()]
+    frames = [each for each in before if each["event"] == "frame"]
+    summary = told(capsys, *command, "--dry-run")
+    assert [json.loads(line) for line in (tmp_path / "log").read_text().splitlines()] == before
+    assert (summary["to_make"], summary["skipped"]) == (1, 2)
+    assert summary["would_make"] == [str(victim)]
+    assert summary["disk_mb"] == pytest.approx(size / 1e6, rel=0.2)
+    assert summary["seconds"] == frames[-1]["seconds_each"]
+    assert summary["memory_mb"] == frames[-1]["memory_mb"] > 50.0
+    run(*command[:-1], "--dry-run", "--overwrite", "-v")
+    said = capsys.readouterr().out
+    assert said.count("would make") == 3
+    assert "would_make" not in said
+
+
+def test_a_dry_run_ends_as_the_batch_would(weights, images, tmp_path, capsys) -> None:
+    output = ("-o", tmp_path / "out", "--dry-run")
+    run("reconstruct", weights, *images[1:], *QUICK, *output[:2])
+    with pytest.raises(OutputExistsError):
+        run("reconstruct", weights, *images, *QUICK, *output)
+    with pytest.raises(UsageError, match="same output"):
+        run("reconstruct", weights, images[0], images[0], *QUICK, *output)
+    spoil(images[0], "empty")
+    with pytest.raises(InputError, match="f0.tif: is empty"):
+        run("reconstruct", weights, *images, *QUICK, *output)
+    summary = told(
+        capsys, "reconstruct", weights, *images, *QUICK, *output[:2], "--keep-going", "--resume", "--dry-run"
+    )
+    assert (summary["to_make"], summary["skipped"], summary["unreadable"]) == (0, 2, 1)
+
+
+def test_a_dry_run_of_pairs(pairs, tmp_path, capsys) -> None:
+    command = ("correlate", *pairs, "--pairing", "ab", "--windows", 8, "--derived", "-o", tmp_path / "out")
+    summary = told(capsys, *command, "--dry-run")
+    assert (summary["pairs"], summary["to_make"]) == (2, 2)
+    assert 300.0 < summary["memory_mb"] < 310.0
+    run(*command)
+    written = sum(path.stat().st_size for path in (tmp_path / "out").iterdir()) / 1e6
+    assert written < summary["disk_mb"] < 10.0 * written
+    bad = tmp_path / "b1.vtkhdf"
+    bad.write_bytes(pairs[3].read_bytes()[:-200])
+    summary = told(
+        capsys,
+        "correlate",
+        *pairs[:3],
+        bad,
+        "--pairing",
+        "ab",
+        "--keep-going",
+        "-o",
+        tmp_path / "two",
+        "--windows",
+        8,
+        "--dry-run",
+    )
+    assert (summary["to_make"], summary["unreadable"]) == (1, 1)
+
+
+def test_the_last_event_of_a_command_is_found(tmp_path: Path) -> None:
+    log = EventLog(tmp_path / "log", "reconstruct")
+    assert log.last("frame") is None
+    for number in (1, 2):
+        log.write("frame", {"step": "reconstruct", "done": number})
+    EventLog(tmp_path / "log", "correlate").write("frame", {"step": "reconstruct", "done": 3})
+    log.write("frame", {"step": "other", "done": 4})
+    with open(tmp_path / "log", "a") as file:
+        file.write('{"cut')
+    found = log.last("frame", step="reconstruct")
+    assert found is not None
+    assert found["done"] == 2

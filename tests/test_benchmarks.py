@@ -48,9 +48,7 @@ def test_growth_is_that_of_the_last_quarter_over_the_second() -> None:
 
 
 @pytest.mark.slow
-def test_the_cost_of_a_batch_and_what_workers_gain_are_printed(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_cost_of_a_batch_and_of_workers_is_printed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     experiment = small_experiment(tmp_path, pairs=2)
     assert len(set(digests(tmp_path / "images").values())) == 4
     print_throughput(experiment, tmp_path)
@@ -297,9 +295,7 @@ def test_readers_take_or_refuse_whatever_comes(tmp_path: Path, name: str) -> Non
     taken_or_refused()
 
 
-def test_failures_are_named_and_kept(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_failures_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     def damaged(chosen: random.Random, whole: bytes) -> bytes:
         return [b"", b"\0", b"\1", b"\2"][chosen.randrange(4)]
 

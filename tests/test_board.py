@@ -1,28 +1,34 @@
-"""The board's pose against boards rendered ray by ray, which share nothing with the fit but the optics."""
+"""Boards: their poses against boards rendered ray by ray, and rays fitted to several against rays that were traced."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import ArrayLike, NDArray
+import tifffile
+from numpy.typing import ArrayLike
 
+from lfpiv_cli.arrays import Floats, Singles
 from lfpiv_cli.calibration.board import disc_shape, locate_board
 from lfpiv_cli.calibration.board_pose import BoardGeometry, BoardPose, pose_of_dots
-from lfpiv_cli.calibration.shape_fit import (
-    disc_polygon_area,
-    lens_cell,
-    lens_crossings,
-    pixel_rays,
-    scene_shares,
-)
+from lfpiv_cli.calibration.dlfc import SeenBoard, aligned, entrance_pupil_mm, fit_rays, shown
+from lfpiv_cli.calibration.shape_fit import disc_polygon_area, lens_cell, lens_crossings, pixel_rays, scene_shares
+from lfpiv_cli.calibration.sheet import entrance_pupil_notices
 from lfpiv_cli.calibration.views import refocusing
 from lfpiv_cli.errors import InputError
-from lfpiv_cli.optics.camera import Camera, Lattice, undistorted
+from lfpiv_cli.files.weights_file import open_weights
+from lfpiv_cli.names import ColumnAxis
+from lfpiv_cli.optics.camera import Camera, Lattice, thin_lens, undistorted
 from lfpiv_cli.optics.media import Media
-from lfpiv_cli.optics.tracing import disc_points, trace
+from lfpiv_cli.optics.tracing import ObjectSpace, disc_points, trace
+from lfpiv_cli.synthetic import board as synthetic_board
+from lfpiv_cli.synthetic.board import BoardPlacement, render_board
+from tests.commands import table2_rig
+from tests.hostile_files import ended
 from tests.known_rays import slopes_equivalent
+from tests.operators import column_image
 
 BOARD = BoardGeometry((3, 3), 0.6, 0.2)
 # Twenty rays per lit pixel: a dot's depth is then known to some 0.03 mm, a board's to 0.01 mm.
@@ -35,7 +41,7 @@ def small(camera: Camera) -> Camera:
     return replace(camera, columns=480, rows=440, lattice=shifted)
 
 
-def dot_places(board: BoardGeometry, z_mm: float, offset: ArrayLike, tilt_deg: ArrayLike) -> NDArray[np.float64]:
+def dot_places(board: BoardGeometry, z_mm: float, offset: ArrayLike, tilt_deg: ArrayLike) -> Floats:
     """Centres (n, 3) of a rigid board's dots in world axes: z = z0 + tan a x + tan b y from the board's centre."""
     slope = np.tan(np.deg2rad(tilt_deg))
     along = np.array([1.0, 0.0, slope[0]]) / np.hypot(1.0, slope[0])
@@ -45,9 +51,7 @@ def dot_places(board: BoardGeometry, z_mm: float, offset: ArrayLike, tilt_deg: A
     return steps * board.spacing_mm + np.append(offset, z_mm)
 
 
-def picture(
-    camera: Camera, media: Media, dots: NDArray[np.float64], diameter: float, rng: np.random.Generator
-) -> NDArray[np.float32]:
+def picture(camera: Camera, media: Media, dots: Floats, diameter: float, rng: np.random.Generator) -> Singles:
     """Count rays from uniformly bright discs on the pixels."""
     image = np.zeros(camera.rows * camera.columns)
     for dot in dots:
@@ -156,8 +160,8 @@ def test_pose_of_exact_dots_is_exact_with_dots_missing_and_dirt(table2: Camera) 
     assert first[1] < -1.5
 
 
-def test_dots_that_gaps_cut_off_belong_to_the_board(table2: Camera) -> None:
-    """A missing row and a missing column leave four islands, and a stray dot lies in the middle."""
+def test_dots_that_gaps_cut_off_belong_to_the_board_and_strays_do_not(table2: Camera, rng: np.random.Generator) -> None:
+    # A missing row and a missing column leave four islands, and a stray dot lies in the middle.
     board = BoardGeometry((5, 5), 1.0, 0.2)
     dots = dot_places(board, 2.0, (0.1, 0.0), (1.0, 0.0)).reshape(5, 5, 3)
     kept = np.delete(np.delete(dots, 2, axis=0), 2, axis=1).reshape(-1, 3)
@@ -165,14 +169,24 @@ def test_dots_that_gaps_cut_off_belong_to_the_board(table2: Camera) -> None:
     pose = pose_of_dots(kept, np.full(kept.shape, 1e-3), -kept[:, :2], table2, board)
     assert len(pose.indices) >= 16
     np.testing.assert_allclose(pose.offset_mm, (0.1, 0.0), atol=0.02)
+    board = BoardGeometry((7, 7), 1.0, 0.2)
+    dots = dot_places(board, 3.0, (0.4, -0.2), (0.5, -0.5)) + rng.normal(0.0, 1e-3, (49, 3))
+    dots[5, 2] += 0.5
+    pose = pose_of_dots(dots, np.full(dots.shape, 1e-3), -dots[:, :2], table2, board)
+    assert len(pose.indices) == 48
+    # One micrometre of noise over 48 dots; with the stray dot the depth would be off by a hundredth.
+    assert pose.z0_mm == pytest.approx(3.0, abs=1e-3)
 
 
-def test_a_plane_that_no_ray_meets_in_view_is_dark(table2: Camera) -> None:
+def test_a_plane_that_no_ray_meets_in_view_is_dark_and_distortion_is_undone(table2: Camera) -> None:
     pixels = (np.array([200, 210]), np.array([230, 240]))
     _, _, pictures = refocusing(small(table2), Media(), pixels, 3, 0.01, 1.0)
     (picture,) = pictures(-100.0, np.ones(2))
     assert picture.dtype == np.float64
     assert not picture.any()
+    ideal = np.array([[3.0, -4.0], [0.0, 0.0], [6.0, 1.0]])
+    seen = ideal * (1 + 2e-4 * np.sum(ideal**2, axis=1, keepdims=True))
+    np.testing.assert_allclose(undistorted(seen, 2e-4), ideal, atol=1e-7)
 
 
 def test_a_turned_board_is_refused(table2: Camera) -> None:
@@ -183,16 +197,6 @@ def test_a_turned_board_is_refused(table2: Camera) -> None:
     assert len(pose_of_dots(dots, sigma, array, table2, board).indices) == 19
     with pytest.raises(InputError, match="19 of the dots .* 5 x 4 along x and y, and 16 .* 4 x 5; correct board.dots"):
         pose_of_dots(dots, sigma, array, table2, replace(board, dots=(4, 5)))
-
-
-def test_a_dot_off_the_plane_does_not_move_the_board(table2: Camera, rng: np.random.Generator) -> None:
-    board = BoardGeometry((7, 7), 1.0, 0.2)
-    dots = dot_places(board, 3.0, (0.4, -0.2), (0.5, -0.5)) + rng.normal(0.0, 1e-3, (49, 3))
-    dots[5, 2] += 0.5
-    pose = pose_of_dots(dots, np.full(dots.shape, 1e-3), -dots[:, :2], table2, board)
-    assert len(pose.indices) == 48
-    # One micrometre of noise over 48 dots; with the stray dot the depth would be off by a hundredth.
-    assert pose.z0_mm == pytest.approx(3.0, abs=1e-3)
 
 
 @pytest.mark.thorough
@@ -227,12 +231,6 @@ def test_slopes_of_the_shares_are_their_differences(camera: Camera, water: Media
         assert np.percentile(off, 99) < 1e-4 * np.abs(slopes[:, axis]).max()
 
 
-def test_undistorted_undoes_the_distortion() -> None:
-    ideal = np.array([[3.0, -4.0], [0.0, 0.0], [6.0, 1.0]])
-    seen = ideal * (1 + 2e-4 * np.sum(ideal**2, axis=1, keepdims=True))
-    np.testing.assert_allclose(undistorted(seen, 2e-4), ideal, atol=1e-7)
-
-
 @pytest.mark.thorough
 def test_pictures_without_a_board_are_refused(table2: Camera, rng: np.random.Generator) -> None:
     camera = small(table2)
@@ -247,3 +245,162 @@ def test_pictures_without_a_board_are_refused(table2: Camera, rng: np.random.Gen
     noise = rng.normal(0.0, 5.0, empty.shape).astype(np.float32)
     with pytest.raises(InputError):
         locate_board(noise, camera, BOARD, Media())
+
+
+SMALL_BOARD = BoardGeometry((5, 4), 0.5, 0.2, medium="fluid")
+DEPTHS = (-4.0, -1.0, 1.5, 5.0)
+LEVEL = 20_000.0
+
+
+@pytest.fixture(autouse=True)
+def _few_rays(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(synthetic_board, "RAYS_PER_POINT", 150)  # 40,000 a dot, some 400 a lit pixel
+
+
+def sensor_of(camera, columns=520, rows=440):
+    lattice = Lattice.regular(0.1, camera.lattice.layout, 0.0, (0.013, -0.021))
+    return replace(camera, columns=columns, rows=rows, lattice=lattice)
+
+
+def pictures(camera, media, rng, places, board=SMALL_BOARD):
+    space = ObjectSpace(media, None, "paraxial")
+    return [render_board(camera, space, board, place, LEVEL, rng) for place in places]
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("column_axis", ["x", "y"])
+def test_fitted_rays_meet_the_array_where_traced_ones_do_eq_1(
+    camera: Camera, water: Media, rng: np.random.Generator, column_axis: ColumnAxis
+) -> None:
+    seen_by = replace(sensor_of(camera), distortion_per_mm2=2e-3, column_axis=column_axis)
+    if column_axis == "y":
+        seen_by = replace(seen_by, columns=440, rows=520)
+    places = [BoardPlacement(z, (0.05, -0.03), rotation_deg=1.5) for z in DEPTHS]
+    told = replace(seen_by, distortion_per_mm2=0.0)  # the data sheet knows nothing of it
+    fit = fit_rays(pictures(seen_by, water, rng, places), DEPTHS, told, SMALL_BOARD, water)
+    assert fit.rays.degree == 3
+    assert fit.sightings > 13_900  # of 14,160: 20 dots, 4 boards, 177 views
+    points = seen_by.to_image_axes(rng.uniform((-0.8, -0.5, -4.0), (0.8, 0.5, 5.0), (500, 3)))
+    lens = disc_points(500, 10.0, rng)
+    truth = trace(seen_by, lens, slopes_equivalent(points, lens, seen_by, water)).array_mm
+    # One sighting is off by 2.5 um, by the dot's phase against the microlenses, which views share: 80 dots and 56 terms
+    # leave 0.6. The distortion moves rays by up to 2 um, the board's turn by 20.
+    error = fit.rays.on_array(points, lens) - truth
+    assert np.sqrt(np.mean(error**2)) < 0.9e-3
+
+
+@pytest.mark.thorough
+def test_boards_at_several_depths_show_the_entrance_pupil_and_rays_are_fitted_behind_it(
+    table2: Camera, water: Media, rng: np.random.Generator
+) -> None:
+    """A lens of P = 1.3, told as a thin one: its entrance pupil is 100 (1/1.3 + 1) = 176.9 mm away, not 200."""
+    told = replace(sensor_of(table2), aperture_mm=22.0)
+    seen_by = thin_lens(told, 1.0 / 1.3)
+    images = pictures(seen_by, water, rng, [BoardPlacement(z, (0.05, -0.03)) for z in DEPTHS])
+    told = told.with_micro_images(seen_by.micro_image_lattice_px())  # as a white image has it
+    fit = fit_rays(images, DEPTHS, told, SMALL_BOARD, water)
+    assert 0.3 < fit.entrance_pupil_sigma_mm < 1.5
+    assert fit.entrance_pupil_mm == pytest.approx(100.0 / 1.3 + 100.0, abs=2.0 * fit.entrance_pupil_sigma_mm)
+    camera = fit.behind_its_pupil(told)
+    assert camera.focus_distance_mm == pytest.approx(fit.entrance_pupil_mm, rel=1e-12)
+    assert fit.behind_its_pupil(camera) is camera
+    points = rng.uniform((-0.8, -0.5, -4.0), (0.8, 0.5, 5.0), (500, 3))
+    lens = disc_points(500, 10.0, rng)
+    truth = trace(seen_by, lens, slopes_equivalent(points, lens, seen_by, water)).array_mm
+    # The crossings of the thin lens are an eighth too far out: rays were off by 7 um.
+    error = fit.rays.on_array(points, lens) - truth
+    assert np.sqrt(np.mean(error**2)) < 0.9e-3
+    (notice,) = entrance_pupil_notices(fit.entrance_pupil_mm, fit.entrance_pupil_sigma_mm, told)
+    assert "pupil_ratio (1.3 if all else is right)" in notice.remedy
+
+
+@pytest.mark.parametrize("entrance_over_exit", [1.25, 1.0, 0.6, 0.0])
+def test_the_entrance_pupil_follows_from_how_boards_shrink(
+    table2: Camera, rng: np.random.Generator, entrance_over_exit
+) -> None:
+    camera = thin_lens(replace(table2, magnification=-0.6), entrance_over_exit)
+    plate = rng.uniform(-2.0, 2.0, (9, 2))
+    dot, crossing = np.repeat(np.arange(9), 20), rng.uniform(-9.0, 9.0, (180, 2))
+    boards = []
+    for z in (-4.0, -1.5, 2.0, 6.0):
+        distance = camera.focus_distance_mm + (z + 0.7) / 1.33  # depths count from anywhere
+        turned = plate @ np.array([[1.0, 0.01], [-0.01, 1.0]]) / np.hypot(1, 0.01)
+        forward = camera.image_distance_mm / distance
+        array = camera.defocus(distance) * crossing - forward * (turned + (0.3, -0.2))[dot]
+        boards.append(shown(z, plate, dot, 1.1 * crossing, array))
+    found, sigma = entrance_pupil_mm(boards, 1.0 / 1.33)
+    assert found == pytest.approx(100.0 * (entrance_over_exit + 1.0 / 0.6), rel=1e-9)
+    assert 0.0 < sigma < 0.01 * found
+    assert entrance_pupil_mm(boards[:2], 1.0 / 1.33) is None
+    assert entrance_pupil_mm([each * (-1.0, 1.0, 1.0, 1.0) for each in boards], 1.0 / 1.33) is None
+
+
+@pytest.mark.thorough
+def test_three_depths_give_degree_two_and_two_are_refused(
+    table2: Camera, water: Media, rng: np.random.Generator
+) -> None:
+    camera = sensor_of(table2)
+    images = pictures(camera, water, rng, [BoardPlacement(z) for z in (-4.0, 0.5, 5.0)])
+    assert fit_rays(images, (-4.0, 0.5, 5.0), camera, SMALL_BOARD, water).rays.degree == 2
+    with pytest.raises(InputError, match="boards at 2 different depths"):
+        fit_rays(images[:2], (-4.0, 0.5), camera, SMALL_BOARD, water)
+    with pytest.raises(InputError, match="the board at 2 mm"):
+        fit_rays([np.zeros_like(images[0]), *images[1:]], (2.0, 0.5, 5.0), camera, SMALL_BOARD, water)
+    narrow = replace(SMALL_BOARD, dots=(5, 2))
+    images = pictures(camera, water, rng, [BoardPlacement(z) for z in DEPTHS], narrow)
+    with pytest.raises(InputError, match="5 x 2 dots"):
+        fit_rays(images, DEPTHS, camera, narrow, water)
+
+
+def test_boards_that_lost_dots_are_numbered_as_the_others() -> None:
+    index = np.stack(np.meshgrid(np.arange(5), np.arange(4), indexing="ij"), axis=-1).reshape(-1, 2)
+    place = 0.5 * (index - np.array([2.0, 1.5])) + (0.02, 0.01)
+    lost = index[:, 0] > 0  # its first column; the others were numbered from 0
+    boards = [SeenBoard(np.zeros((1, 1)), z, 0.0, 1.0, place, index) for z in (-1.0, 1.0)]
+    boards.append(SeenBoard(np.zeros((1, 1)), 2.0, 0.0, 1.0, place[lost], index[lost] - (1, 0)))
+    np.testing.assert_array_equal(aligned(boards, SMALL_BOARD)[2].index, index[lost])
+
+
+@pytest.fixture
+def rig(tmp_path: Path):
+    board = {"dots": [5, 4], "spacing_mm": 0.5, "dot_diameter_mm": 0.2, "medium": "fluid"}
+    volume = {"shape_xyz": [5, 4, 3], "voxel_mm": 0.1, "centre_mm": [0.3, -0.2, 3.0]}
+    path, unpadded = tmp_path / "rig.yaml", {"padding_voxel": [0, 0, 0]}
+    path.write_text(table2_rig(520, 440, board=board, volume=volume, reconstruction=unpadded))
+    return path
+
+
+@pytest.mark.thorough
+def test_from_boards_at_depths_to_columns(
+    rig: Path, tmp_path: Path, table2: Camera, water: Media, rng: np.random.Generator
+) -> None:
+    lattice = table2.lattice
+    camera = replace(table2, columns=520, rows=440, lattice=lattice)
+    boards = []
+    for z, image in zip(DEPTHS, pictures(camera, water, rng, [BoardPlacement(z) for z in DEPTHS]), strict=True):
+        path = tmp_path / f"board{z}.tif"
+        tifffile.imwrite(path, np.rint(image).astype(np.uint16))
+        boards += ["--board", path, "--depth-mm", z]
+    assert ended("calibrate-snapshot", rig, *boards, "-o", tmp_path / "c.h5") == (0, "")
+    columns, told = [], ("build-weights", rig, "--calibration", tmp_path / "c.h5")
+    for method in ("ert", "dlfc"):
+        assert ended(*told, "--method", method, "-o", tmp_path / method) == (0, "")
+        weights = open_weights(tmp_path / method)
+        assert not weights.weights.on_demand
+        columns.append(column_image(weights, 2, 1, 3))
+    # What is left of 0.1 to 0.3 um on the array, and of two ways to integrate.
+    assert np.abs(columns[0] - columns[1]).sum() < 0.06
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "message"),
+    [
+        ("calibrate-snapshot {} --board a.tif --board b.tif -o c.h5", 2, "with its depth"),
+        ("calibrate-snapshot {} --white a.tif --depth-mm 1 --depth-mm 2 -o c.h5", 2, "0 --board and 2"),
+        ("build-weights {} --method dlfc -o w.h5", 3, "boards at several depths"),
+        ("build-weights {} --method dlfc --refraction exact -o w.h5", 3, "no refraction besides"),
+    ],
+)
+def test_what_cannot_be_is_refused_in_a_sentence(rig: Path, words: str, code: int, message) -> None:
+    found, said = ended(*words.format(rig).split())
+    assert (found, message in said) == (code, True), said

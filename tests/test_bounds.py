@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.optics.camera import Camera, Lattice
 from lfpiv_cli.optics.media import Media
 from lfpiv_cli.particles.view import Light, View, raw_view
@@ -39,11 +39,7 @@ def view(request: pytest.FixtureRequest) -> View:
     return raw_view(camera, Media(1.0, 1.49, 1.33), 0.025, light=light)
 
 
-def model(view: View, particles: NDArray[np.float64]) -> NDArray[np.float64]:
-    return expected_image(slopes(view, particles), particles)
-
-
-def fitted(view: View, image: NDArray[np.float64], weight: NDArray[np.float64]) -> NDArray[np.float64]:
+def fitted(view: View, image: Floats, weight: Floats) -> Floats:
     """Return the particles (n, 4) that fit an image best, by weighted least squares from the truth."""
     particles = PARTICLES.copy()
     for _ in range(STEPS):
@@ -60,7 +56,8 @@ def test_slopes_are_finite_differences(view: View) -> None:
     for unknown, step in enumerate((1e-3, 1e-3, 1e-2, 1.0)):
         moved = np.zeros_like(PARTICLES)
         moved[1, unknown] = step
-        difference = (model(view, PARTICLES + moved) - model(view, PARTICLES - moved)) / (2.0 * step)
+        there = [expected_image(slopes(view, each), each) for each in (PARTICLES + moved, PARTICLES - moved)]
+        difference = (there[0] - there[1]) / (2.0 * step)
         analytic = slope[:, [UNKNOWNS + unknown]].toarray().ravel()
         # Steps that are small against the ball's 0.05 mm; the kinks of its profile within them remain.
         assert np.abs(analytic - difference).sum() < 0.04 * np.abs(difference).sum()
@@ -117,6 +114,10 @@ def test_place_is_hardly_known_in_focus_and_not_at_all_off_the_sensor(view: View
     sigma = cramer_rao_bound(slope, pixel_variance(expected_image(slope, particles), READOUT)).sigma_mm(joint=False)
     assert np.all(sigma[0, :2] > 20.0 * sigma[1, :2])
     assert np.all(np.isinf(sigma[2]))
+    # No particles have no bound.
+    slope = slopes(view, np.zeros((0, UNKNOWNS)))
+    bound = cramer_rao_bound(slope, np.ones(view.camera.rows * view.camera.columns))
+    assert bound.joint.shape == (0, UNKNOWNS, UNKNOWNS)
 
 
 def test_variance_adds_up() -> None:
@@ -125,12 +126,3 @@ def test_variance_adds_up() -> None:
     assert pixel_variance(light, READOUT) == pytest.approx([base, base, base + 200.0])
     assert pixel_variance(light, replace(READOUT, photons_per_count=None)) == pytest.approx([base] * 3)
     assert pixel_variance(light, READOUT, counts_per_ray=10.0)[2] > base + 200.0
-
-
-def test_no_particles_have_no_bound(view: View) -> None:
-    slope = slopes(view, np.zeros((0, UNKNOWNS)))
-    assert cramer_rao_bound(slope, np.ones(view.camera.rows * view.camera.columns)).joint.shape == (
-        0,
-        UNKNOWNS,
-        UNKNOWNS,
-    )

@@ -10,8 +10,8 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.calibration.board_pose import BoardGeometry, BoardPose, pose_of_dots
 from lfpiv_cli.calibration.lattice import LatticeFit
 from lfpiv_cli.calibration.model import (
@@ -42,7 +42,7 @@ UNCERTAIN = "pitch_px rotation_deg origin_px k1_per_mm2 board_z_mm tilt_deg offs
 UNCERTAIN += " image_distance_mm dlfc_entrance_pupil_mm"
 
 
-def white_image() -> NDArray[np.float64]:
+def white_image() -> Floats:
     lattice = Lattice.regular(14.3, "square", np.deg2rad(1.5), (108.0, 91.0))
     row, column = np.indices(SHAPE)
     place = np.stack([column, row], axis=-1)
@@ -70,9 +70,8 @@ def rig(table2: Camera, water: Media) -> Rig:
 
 def test_eq21_by_hand(water: Media) -> None:
     # t_b + t_w/n_ag + D/(2 n_w) = 1.5 + 5/1.49 + 10/2.66
-    assert advised_move_mm(replace(BOARD, thickness_mm=1.5), CHANNEL, water) == pytest.approx(
-        1.5 + 3.3557047 + 3.7593985
-    )
+    advised = advised_move_mm(replace(BOARD, thickness_mm=1.5), CHANNEL, water)
+    assert advised == pytest.approx(1.5 + 3.3557047 + 3.7593985)
 
 
 def test_mid_plane_follows_from_board_and_move(plain: Calibration, rig: Rig) -> None:
@@ -87,10 +86,7 @@ def test_mid_plane_follows_from_board_and_move(plain: Calibration, rig: Rig) -> 
     assert with_mid_plane(plain, pose, replace(rig, channel=None)).mid_plane_z_mm is None
     in_water = replace(rig, board=replace(BOARD, medium="fluid"))
     assert with_mid_plane(plain, pose, in_water).camera_move_mm is None
-
-
-def test_mid_plane_follows_from_a_board_in_the_fluid(plain: Calibration, rig: Rig) -> None:
-    pose = exact_pose(-0.35)
+    # Mid plane follows from a board in the fluid.
     near_wall = replace(
         rig, board=replace(BOARD, medium="fluid"), channel=replace(CHANNEL, board_from_mid_plane_mm=-5.0)
     )
@@ -104,7 +100,7 @@ def test_mid_plane_follows_from_a_board_in_the_fluid(plain: Calibration, rig: Ri
 
 
 @pytest.mark.parametrize("with_board", [False, True])
-def test_summary_has_the_contracts_names_and_no_nan(plain: Calibration, rig: Rig, with_board: bool) -> None:
+def test_summary_and_tree_bring_everything_back_without_nan(plain: Calibration, rig: Rig, with_board: bool) -> None:
     calibration = plain
     if with_board:
         pose = exact_pose(0.2)
@@ -115,18 +111,6 @@ def test_summary_has_the_contracts_names_and_no_nan(plain: Calibration, rig: Rig
     unknown = {name for name, value in summary.items() if value is None and not name.startswith("dlfc_")}
     assert (unknown == {"image_distance_mm", "image_distance_mm_sigma"}) == with_board
     assert summary["lenses"] == plain.fit.lenses
-
-
-def leaves(tree: dict[str, Any]) -> list[Any]:
-    return [leaf for value in tree.values() for leaf in (leaves(value) if isinstance(value, dict) else [value])]
-
-
-@pytest.mark.parametrize("with_board", [False, True])
-def test_a_tree_brings_everything_back(plain: Calibration, rig: Rig, with_board: bool) -> None:
-    calibration = plain
-    if with_board:
-        pose = exact_pose(0.2)
-        calibration = with_mid_plane(replace(plain, pose=pose), pose, rig)
     tree = calibration.to_tree()
     assert all(isinstance(leaf, np.ndarray | int | float | str | None) for leaf in leaves(tree))
     back = Calibration.from_tree(tree)
@@ -142,14 +126,20 @@ def test_a_tree_brings_everything_back(plain: Calibration, rig: Rig, with_board:
         np.testing.assert_array_equal(back.pose.dots_mm, calibration.pose.dots_mm)
 
 
-def test_a_tree_with_a_hole_is_refused(plain: Calibration) -> None:
+def leaves(tree: dict[str, Any]) -> list[Any]:
+    return [leaf for value in tree.values() for leaf in (leaves(value) if isinstance(value, dict) else [value])]
+
+
+def test_a_tree_with_a_hole_and_a_board_of_another_shape_are_refused(plain: Calibration, rig: Rig) -> None:
     tree = plain.to_tree()
     del tree["lattice"]["indices"]
     with pytest.raises(InputError, match="not complete"):
         Calibration.from_tree(tree)
+    with pytest.raises(InputError, match=r"\(180, 220\), \(3, 3\)"):
+        calibrate(Photographs([white_image()], board=np.zeros((3, 3))), rig)
 
 
-def test_the_camera_takes_the_upright_lattice(plain: Calibration, rig: Rig) -> None:
+def test_the_camera_takes_the_upright_lattice_and_a_magnification_that_differs(plain: Calibration, rig: Rig) -> None:
     camera = plain.camera(rig.camera)
     micro_images = camera.micro_image_lattice_px()
     upright = plain.rectification.lattice_px
@@ -158,19 +148,11 @@ def test_the_camera_takes_the_upright_lattice(plain: Calibration, rig: Rig) -> N
     assert camera.magnification == -1.0
     with pytest.raises(InputError, match=r"180 x 220.*181 x 220"):
         plain.camera(replace(rig.camera, rows=181))
-
-
-def test_the_camera_takes_the_magnification_only_when_it_differs(plain: Calibration, rig: Rig) -> None:
     pose = exact_pose(0.0)
     within = replace(pose, magnification=-1.0 + 2 * pose.magnification_sigma)
     beyond = replace(pose, magnification=-1.0 + 5 * pose.magnification_sigma)
     assert replace(plain, pose=within).camera(rig.camera).magnification == -1.0
     assert replace(plain, pose=beyond).camera(rig.camera).magnification == beyond.magnification
-
-
-def test_a_board_of_another_shape_is_refused(rig: Rig) -> None:
-    with pytest.raises(InputError, match=r"\(180, 220\), \(3, 3\)"):
-        calibrate(Photographs([white_image()], board=np.zeros((3, 3))), rig)
 
 
 @pytest.mark.thorough

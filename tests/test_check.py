@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from numpy.typing import NDArray
 
 from lfpiv_cli import correlate
+from lfpiv_cli.arrays import Singles
 from lfpiv_cli.calibration.model import Calibration, Channel
 from lfpiv_cli.cli.main import cli
 from lfpiv_cli.errors import ConfigError
@@ -25,7 +25,7 @@ from lfpiv_cli.files.rig_numbers import RigNumbers, rig_text, tree_of
 from lfpiv_cli.optics.camera import Camera, Lattice
 from lfpiv_cli.optics.media import Media
 from lfpiv_cli.optics.tracing import ObjectSpace
-from lfpiv_cli.paper.small_rig import Rig, Search
+from lfpiv_cli.paper.small_rig import Case, Rig
 from lfpiv_cli.particles.view import raw_view
 from lfpiv_cli.synthetic.render import Balls, Readout, render_points, render_white
 from lfpiv_cli.validation.planning import (
@@ -45,7 +45,7 @@ from lfpiv_cli.verbs.planning import bench_of, diffraction_line, rig_figures, ri
 
 WATER = Media(1.0, 1.49, 1.33)
 Tree = dict[str, Any]
-Image = NDArray[np.float32]
+Image = Singles
 
 
 def changed(tree: Tree, **keys: Any) -> Tree:
@@ -80,21 +80,13 @@ GOOD_RIGS = {
 BAD_RIGS = {
     "f-numbers differ a little": (changed(PLAIN, camera__main_lens__f_number=2.8), "f-numbers", "look"),
     "f-numbers differ": (changed(PLAIN, camera__main_lens__f_number=16.0), "f-numbers", "no"),
-    "beyond the depth of field": (
-        changed(PLAIN, volume__size_mm=[2.0, 2.0, 70.0], window=None),
-        "depth of field",
-        "no",
-    ),
+    "beyond the depth of field": (changed(PLAIN, volume__size_mm=[2, 2, 70], window=None), "depth of field", "no"),
     "beyond the field of view": (changed(PLAIN, volume__size_mm=[20.0, 20.0, 8.0]), "field of view", "no"),
     "too dense": (changed(PLAIN, simulation__particles=60000), "seeding", "no"),
     "too sparse": (changed(PLAIN, simulation__particles=20), "seeding", "look"),
     "hardly any light": (changed(PLAIN, simulation__particle_counts=300.0), "precision", "no"),
     "a long time between images": (changed(PLAIN, correlation__dt_s=0.1), "time step", "no"),
-    "voxels too wide": (
-        changed(PLAIN, volume={"shape_xyz": [40, 40, 50], "voxel_mm": [0.2, 0.2, 0.2]}),
-        "voxels",
-        "no",
-    ),
+    "voxels too wide": (changed(PLAIN, volume={"shape_xyz": [40, 40, 50], "voxel_mm": [0.2] * 3}), "voxels", "no"),
     "windows too large": (changed(PLAIN, correlation__window_mm=20.0), "windows", "no"),
 }
 REFUSED = {
@@ -184,6 +176,7 @@ SMALL = tree_of(RigNumbers(columns=400, rows=360, size_mm=(1.5, 1.3, 6.0)))
 SMALL["simulation"]["particles"] = 100
 SMALL["correlation"]["window_mm"] = [0.4, 0.4, 1.6]
 READOUT = Readout()
+NOISY = replace(READOUT, read_noise_counts=40.0)
 
 
 @pytest.mark.thorough
@@ -280,11 +273,7 @@ GOOD_IMAGES: dict[str, Callable[[Photographer], Image]] = {
 BAD_IMAGES: dict[str, tuple[Callable[[Photographer], Image], str, tuple[str, ...]]] = {
     "saturated": (lambda take: np.minimum(take.tracers(counts=4e6), 4095.0), "exposure", ("no",)),
     "black": (lambda take: take.dark(), "light", ("no",)),
-    "noisy": (
-        lambda take: take.tracers(counts=2e4, readout=replace(READOUT, read_noise_counts=40.0)),
-        "light",
-        ("look", "no"),
-    ),
+    "noisy": (lambda take: take.tracers(counts=2e4, readout=NOISY), "light", ("look", "no")),
     "array moved since the white image": (lambda take: take.tracers(camera=take.moved(1.0)), "drift", ("look",)),
     "array moved far": (lambda take: take.tracers(camera=take.moved(5.0)), "drift", ("no",)),
     "light from behind the volume": (lambda take: take.tracers(depth_mm=(6.0, 9.0)), "light outside", ("no",)),
@@ -302,7 +291,7 @@ def test_good_images_are_good(take: Photographer, make: Callable[[Photographer],
 
 @pytest.mark.thorough
 @pytest.mark.parametrize(("make", "about", "expected"), BAD_IMAGES.values(), ids=BAD_IMAGES)
-def test_bad_images_are_told(
+def test_bad_images(
     take: Photographer, make: Callable[[Photographer], Image], about: str, expected: tuple[str, ...]
 ) -> None:
     assert take.verdicts(make(take))[about] in expected
@@ -343,9 +332,7 @@ def test_the_part_in_front_of_a_box_is_where_its_tracers_are(take: Photographer)
     assert (rows.start + rows.stop) / 2 == pytest.approx(row, abs=3.0)
     assert (columns.start + columns.stop) / 2 == pytest.approx(column, abs=3.0)
     assert columns.stop - columns.start == pytest.approx(0.6 / 0.0055, rel=0.03)
-
-
-def test_share_in_view_is_that_of_points(take: Photographer) -> None:
+    # The share in view is that of points.
     bounds = np.array([[-1.5, 1.5], [-0.5, 0.5], [-4.0, 4.0]])
     points = take.rng.uniform(bounds[:, 0], bounds[:, 1], (20000, 3))
     inside = np.abs(points[:, 0]) <= half_view_mm(take.camera, WATER, points[:, 2])[:, 0]
@@ -358,7 +345,7 @@ def test_errors_are_those_that_are_measured() -> None:
     """Tracers that stand apart, found by the program, err by what was told before; rays make hardly any noise."""
     camera = Camera(-1.0, 100.0, 25.0, 0.8, 0.8, Lattice.regular(0.1), 0.0055, 560, 560)
     rig = Rig(camera, WATER, Channel(12.0, 2.0), refraction="paraxial")
-    search, rng = Search(rig, (2.6, 2.6, 8.4)), np.random.default_rng(3)
+    search, rng = Case(rig, rig, (2.6, 2.6, 8.4)), np.random.default_rng(3)
     depths, rays = np.array([-4.0, -2.5, 1.5, 3.0]), 400_000
     seen = in_miniature(camera, WATER, depths, 0.025)
     told = errors_by_depth_mm(seen, Tracer(5e5, 0.025, READOUT), 5e5 / rays)

@@ -1,4 +1,4 @@
-"""The process around the commands: exit codes, signals, closed pipes, start-up."""
+"""The process around the commands: exit codes, signals, closed pipes, start-up, a place for compiled kernels."""
 
 from __future__ import annotations
 
@@ -7,10 +7,12 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import pytest
 
-from tests.commands import AT_FOCUS, CONFIG, SAMPLE, sample_rig
+from lfpiv_cli.files import kernel_cache
+from tests.commands import AT_FOCUS, CONFIG, ROOT, SAMPLE, sample_rig
 
 
 def lfpiv(*arguments: object, **options: object) -> subprocess.CompletedProcess[str]:
@@ -19,13 +21,13 @@ def lfpiv(*arguments: object, **options: object) -> subprocess.CompletedProcess[
 
 
 @pytest.mark.parametrize("module", ["lfpiv_cli", "lfpiv_cli.cli"])
-def test_nothing_heavy_is_imported_for_help_or_by_a_script(module):
+def test_nothing_heavy_is_imported_for_help_or_by_a_script(module) -> None:
     script = f"import sys, {module}; print(sorted({{'numpy', 'numba', 'h5py', 'scipy'}} & set(sys.modules)))"
     assert subprocess.run([sys.executable, "-c", script], capture_output=True, text=True).stdout.strip() == "[]"
 
 
 @pytest.mark.thorough
-def test_exit_codes_and_what_is_said(tmp_path):
+def test_exit_codes_and_what_is_said(tmp_path) -> None:
     broken, target, file = tmp_path / "rig.yaml", tmp_path / "w.h5", tmp_path / "file"
     broken.write_text(CONFIG.read_text().replace("layout:", "layuot:"))
     file.write_text("mine", encoding="utf-8")
@@ -48,12 +50,12 @@ def test_exit_codes_and_what_is_said(tmp_path):
 
 
 @pytest.mark.thorough
-def test_json_goes_to_stdout_alone(tmp_path):
+def test_json_goes_to_stdout_alone(tmp_path) -> None:
     done = lfpiv("build-weights", sample_rig(tmp_path, AT_FOCUS), "-o", tmp_path / "w.h5", "--json")
     assert (done.returncode, done.stdout[0], done.stdout.count("\n"), done.stderr) == (0, "{", 1, "")
 
 
-def test_a_closed_pipe_is_quiet():
+def test_a_closed_pipe_is_quiet() -> None:
     done = subprocess.run(
         f"'{sys.executable}' -m lfpiv_cli --help | head -1", shell=True, capture_output=True, text=True, timeout=60
     )
@@ -93,7 +95,7 @@ except BaseException as error:
         ("SIGHUP", "HungUp", "hung up"),
     ],
 )
-def test_a_signal_during_a_call_back_is_not_lost(sent, name, said):
+def test_a_signal_during_a_call_back_is_not_lost(sent, name, said) -> None:
     words, heard = [sys.executable, "-c", IGNORED_FIRST, sent], {"capture_output": True, "text": True}
     done = subprocess.run(words, check=True, timeout=60, preexec_fn=hear_interrupts, **heard)
     assert done.stdout.split() == ["ignored", name]
@@ -112,7 +114,7 @@ hashlib.pbkdf2_hmac("sha256", b"", b"", 100_000_000)  # half a minute without Py
 
 @pytest.mark.thorough
 @pytest.mark.skipif(os.name == "nt", reason="Windows has no SIGTERM to send")
-def test_a_signal_is_answered_while_a_compiled_call_goes_on():
+def test_a_signal_is_answered_while_a_compiled_call_goes_on() -> None:
     words = [sys.executable, "-c", IN_A_LONG_CALL]
     with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         assert process.stdout.readline() == "begun\n"
@@ -124,7 +126,7 @@ def test_a_signal_is_answered_while_a_compiled_call_goes_on():
 
 
 @pytest.mark.skipif(os.name == "nt", reason="Windows has no SIGHUP")
-def test_what_nohup_has_ignored_stays_so():
+def test_what_nohup_has_ignored_stays_so() -> None:
     script = "import signal; from lfpiv_cli.cli.main import end_by_signals; end_by_signals(); "
     script += "signal.raise_signal(signal.SIGHUP); print('here')"
     ignored = {"preexec_fn": lambda: signal.signal(signal.SIGHUP, signal.SIG_IGN)}
@@ -138,7 +140,7 @@ def test_what_nohup_has_ignored_stays_so():
     ("sent", "code", "said"),
     [("SIGTERM", 143, "terminated"), ("SIGINT", 130, "interrupted"), ("SIGHUP", 129, "hung up")],
 )
-def test_signals_end_the_work_and_leave_nothing(tmp_path, sent, code, said):
+def test_signals_end_the_work_and_leave_nothing(tmp_path, sent, code, said) -> None:
     assert lfpiv("build-weights", sample_rig(tmp_path, AT_FOCUS), "-o", tmp_path / "w.h5").returncode == 0
     # Compilation, which answers late, is over then.
     assert lfpiv("reconstruct", tmp_path / "w.h5", SAMPLE / "pair_a.tif", "-o", tmp_path / "v.vtkhdf").returncode == 0
@@ -181,6 +183,113 @@ main()
 
 
 @pytest.mark.skipif(os.name == "nt", reason="Windows has no SIGTERM to send")
-def test_what_a_library_makes_of_a_signal_is_no_bug():
+def test_what_a_library_makes_of_a_signal_is_no_bug() -> None:
     done = subprocess.run([sys.executable, "-c", A_BROKEN_LIBRARY], capture_output=True, text=True, timeout=60)
     assert (done.returncode, done.stderr) == (143, "lfpiv: terminated\n")
+
+
+# A machine that can be written in its folder for temporary files alone, and a kernel that takes a moment to compile.
+READ_ONLY = """
+import os, tempfile
+access, opened, free = os.access, tempfile.TemporaryFile, tempfile.gettempdir()
+def refused(*given, dir=None, **more):
+    if not str(dir).startswith(free):
+        raise PermissionError(13, "read-only", dir)
+    return opened(*given, dir=dir, **more)
+tempfile.TemporaryFile = refused
+os.access = lambda path, mode: str(path).startswith(free) and access(path, mode)
+"""
+USE = """
+import numpy as np
+import lfpiv_cli
+from lfpiv_cli.optics.media import snell_invariant
+print(snell_invariant(0.1, np.ones(2), np.array([1.0, 1.33])))
+print(os.environ["NUMBA_CACHE_DIR"])
+"""
+
+
+@pytest.fixture
+def process(monkeypatch: pytest.MonkeyPatch) -> pytest.MonkeyPatch:
+    """A process that has no place for compiled code, and whose variable is put back."""
+    monkeypatch.setenv(kernel_cache.VARIABLE, "")
+    monkeypatch.setattr(kernel_cache, "lost", False)
+    monkeypatch.setattr("numba.config.CACHE_DIR", "")
+    return monkeypatch
+
+
+def test_a_place_that_can_be_written_is_numbas_own_affair(process: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    process.setenv(kernel_cache.VARIABLE, str(tmp_path / "made" / "later"))
+    kernel_cache.ensure_place()
+    assert os.environ[kernel_cache.VARIABLE] == str(tmp_path / "made" / "later")
+    assert not kernel_cache.lost
+    # A file in the way is no place.
+    (tmp_path / "file").write_text("")
+    assert not kernel_cache._is_writable(tmp_path / "file" / "cache")
+    assert kernel_cache._is_writable(tmp_path / "cache")
+
+
+def test_without_any_place_the_process_has_one_of_its_own(process: pytest.MonkeyPatch) -> None:
+    process.setattr(kernel_cache, "_is_writable", lambda path: False)
+    kernel_cache.ensure_place()
+    place = Path(os.environ[kernel_cache.VARIABLE])
+    assert place.is_dir()
+    assert kernel_cache.lost
+
+
+def test_a_filled_folder_that_is_read_only_is_copied(process: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    (tmp_path / "kernels").mkdir()
+    (tmp_path / "kernels" / "one.nbi").write_bytes(b"compiled")
+    process.setenv(kernel_cache.VARIABLE, str(tmp_path))
+    process.setattr(kernel_cache, "_is_writable", lambda path: False)
+    kernel_cache.ensure_place()
+    place = Path(os.environ[kernel_cache.VARIABLE])
+    assert place != tmp_path
+    assert (place / "kernels" / "one.nbi").read_bytes() == b"compiled"
+    assert not kernel_cache.lost
+
+
+def test_kernels_of_changed_files_and_of_those_that_import_them_go(tmp_path: Path) -> None:
+    package = tmp_path / "made"
+    (package / "optics" / "__pycache__").mkdir(parents=True)
+    code = {"base": "HALF = 0.5", "lens": "from made.optics.base import HALF"}
+    code |= {"camera": "from made.optics import lens", "wall": "import numpy"}
+    for name, text in code.items():
+        (package / "optics" / f"{name}.py").write_text(text)
+    kernel_cache.forget_outdated(package)
+    kernels = {name: package / "optics" / "__pycache__" / f"{name}.trace-1.py311.nbi" for name in [*code, "removed"]}
+    for kernel in kernels.values():
+        kernel.write_text("compiled")
+    kernel_cache.forget_outdated(package)
+    assert all(kernel.exists() for kernel in kernels.values())
+    os.utime(package / "optics" / "base.py", ns=(1, 1))
+    kernel_cache.forget_outdated(package)
+    assert [name for name, kernel in kernels.items() if kernel.exists()] == ["wall"]
+
+
+@pytest.mark.thorough
+def test_kernels_compile_where_neither_package_nor_home_can_be_written(tmp_path: Path) -> None:
+    surroundings = {name: value for name, value in os.environ.items() if name != kernel_cache.VARIABLE}
+    # A folder of its own: the package may itself lie in the one for temporary files.
+    surroundings["TMPDIR"] = str(tmp_path)
+    done = subprocess.run(
+        [sys.executable, "-c", READ_ONLY + USE], cwd=ROOT, env=surroundings, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    place = done.stdout.splitlines()[1]
+    assert "lfpiv-kernels-" in place
+    assert not Path(place).exists()
+
+
+@pytest.mark.slow
+def test_what_was_warmed_up_is_not_compiled_again(tmp_path: Path) -> None:
+    """The sample's steps find all their kernels in a folder that `warm-up` has filled."""
+    cache, out = tmp_path / "cache", tmp_path / "out"
+    lfpiv = [sys.executable, "-m", "lfpiv_cli"]
+    subprocess.run([*lfpiv, "warm-up", "--cache", str(cache)], cwd=ROOT, check=True)
+    before = set(cache.rglob("*.nbc"))
+    photographs = [f"--{name}={SAMPLE / name}.tif" for name in ("white", "dark", "board")]
+    images = [str(SAMPLE / f"pair_{name}.tif") for name in "ab"]
+    command = [*lfpiv, "run", str(CONFIG), *images, *photographs, "--method", "both", "-o", str(out)]
+    subprocess.run(command, cwd=ROOT, check=True, env=os.environ | {kernel_cache.VARIABLE: str(cache)})
+    assert before
+    assert sorted(path.name for path in set(cache.rglob("*.nbc")) - before) == []

@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import tifffile
-import yaml
 from click.testing import CliRunner
 
 from lfpiv_cli.cli.main import cli
@@ -30,7 +29,9 @@ from lfpiv_cli.weights.columns import ColumnOperator, OnDemandOperator, operator
 from lfpiv_cli.weights.model import Weights
 from lfpiv_cli.weights.operators import FactorisedOperator
 from lfpiv_cli.weights.quadrature import RayCount, count_columns, integrate_columns
+from tests.commands import table2_rig
 from tests.known_rays import slopes_equivalent
+from tests.operators import assert_adjoint, column_image
 
 GRID = Grid.centred((4, 3, 5), (0.1, 0.12, 0.8), (0.1, -0.1, 0.5))
 # As far across, with voxels enough to tell the axes apart.
@@ -61,11 +62,7 @@ def test_forward_and_adjoint_are_adjoint(turned, water, window, rng, column_axis
     on_demand = OnDemandOperator(camera, source, FEW)
     kept = on_demand.restricted(np.ones(on_demand.image_shape, np.float32))
     for operator in (on_demand, kept, Weights(FEW, (0, 0, 0), on_demand, column_axis)):
-        volume = rng.random(operator.shape, dtype=np.float32)
-        image = rng.random(operator.image_shape, dtype=np.float32)
-        left = np.vdot(operator.forward(volume).astype(np.float64), image)
-        right = np.vdot(volume.astype(np.float64), operator.adjoint(image))
-        assert left == pytest.approx(right, rel=1e-5)  # float32 sums of some thousand terms
+        assert_adjoint(operator, rng)
 
 
 def fitted_to(space, camera, depths_mm=(-1.5, -0.5, 0.5, 1.5, 2.5), twist=0.0):
@@ -93,9 +90,7 @@ def test_fitted_rays_factorise_where_their_axes_separate(table2, water, column_a
     for index in list(np.ndindex(*operator.shape))[::7]:
         centre = on_demand.centres_mm(np.array([np.ravel_multi_index(index, operator.shape)]))
         converged = integrate_columns(camera, rays, centre, on_demand.sides_mm, 128, 5).image(0, operator.image_shape)
-        row, column, share = operator.column(*index)
-        converged[row, column] -= share
-        errors.append(np.abs(converged).sum())
+        errors.append(np.abs(converged - column_image(operator, *index)).sum())
     # The rim of the aperture, as for traced rays: 0.01 on average, 0.02 at most; a tenth more for the distortion.
     assert np.mean(errors) < 0.015
     assert np.max(errors) < 0.03
@@ -119,17 +114,17 @@ def test_columns_agree_with_the_factorised_form(table2, water, rng, column_axis)
 
 
 @pytest.mark.thorough
-def test_column_is_the_image_of_one_voxel(turned, water):
+def test_column_is_the_image_of_one_voxel_and_columns_that_are_too_many_are_refused(turned, water, monkeypatch):
     operator = OnDemandOperator(turned, ObjectSpace(water, None, "paraxial"), GRID)
     volume = np.zeros(operator.shape, np.float32)
     volume[3, 1, 2] = 1.0
-    image = np.zeros(operator.image_shape, np.float32)
-    rows, columns, weights = operator.column(3, 1, 2)
-    image[rows, columns] = weights
-    np.testing.assert_array_equal(operator.forward(volume), image)
+    np.testing.assert_array_equal(operator.forward(volume), column_image(operator, 3, 1, 2))
     kept = operator.restricted(operator.forward(volume))
     for one, other in zip(kept.column(3, 1, 2), operator.column(3, 1, 2), strict=True):
         np.testing.assert_array_equal(one, other)
+    monkeypatch.setattr(columns_module, "LARGEST_BYTES", 1000)
+    with pytest.raises(InputError, match="60 voxels"):
+        operator.restricted(np.ones(operator.image_shape, np.float32))
 
 
 @pytest.mark.thorough
@@ -146,23 +141,7 @@ def test_lines_of_sight_keep_what_is_lit_and_leave_most_out(turned, water):
     np.testing.assert_allclose(restricted.forward(volume), operator.forward(volume), atol=1e-7)
 
 
-def test_a_dark_image_has_no_columns(turned, water):
-    operator = OnDemandOperator(turned, ObjectSpace(water, None, "paraxial"), GRID)
-    dark = np.zeros(operator.image_shape, np.float32)
-    restricted = operator.restricted(dark)
-    assert restricted.voxel.size == 0
-    assert not restricted.adjoint(dark + 1.0).any()
-
-
-@pytest.mark.thorough
-def test_too_many_columns_are_refused_with_their_size(turned, water, monkeypatch):
-    operator = OnDemandOperator(turned, ObjectSpace(water, None, "paraxial"), GRID)
-    monkeypatch.setattr(columns_module, "LARGEST_BYTES", 1000)
-    with pytest.raises(InputError, match="60 voxels"):
-        operator.restricted(np.ones(operator.image_shape, np.float32))
-
-
-def test_columns_are_kept_for_many_steps_where_they_fit(turned, water, rng, monkeypatch):
+def test_columns_are_kept_for_many_steps_where_they_fit_and_a_dark_image_has_none(turned, water, rng, monkeypatch):
     operator = OnDemandOperator(turned, ObjectSpace(water, None, "paraxial"), GRID)
     kept = operator.kept()
     assert isinstance(kept, ColumnOperator)
@@ -171,6 +150,10 @@ def test_columns_are_kept_for_many_steps_where_they_fit(turned, water, rng, monk
     np.testing.assert_allclose(kept.forward(volume), operator.forward(volume), atol=1e-6)
     monkeypatch.setattr(columns_module, "LARGEST_BYTES", 1000)
     assert operator.kept() is operator
+    dark = np.zeros(operator.image_shape, np.float32)
+    restricted = operator.restricted(dark)
+    assert restricted.voxel.size == 0
+    assert not restricted.adjoint(dark + 1.0).any()
 
 
 @pytest.mark.thorough
@@ -203,18 +186,12 @@ def test_bricks_are_adjoint_and_nearly_hexagons(table2, water, rng, column_axis)
     camera = replace(table2, columns=380, rows=260, lattice=lattice, column_axis=column_axis)
     bricks = factorise_bricks(camera, water, GRID)
     hexagons = OnDemandOperator(camera, ObjectSpace(water, None, "paraxial"), GRID)
-    volume = rng.random(bricks.shape, dtype=np.float32)
-    image = rng.random(bricks.image_shape, dtype=np.float32)
-    right = np.vdot(volume.astype(np.float64), bricks.adjoint(image))
-    assert np.vdot(bricks.forward(volume).astype(np.float64), image) == pytest.approx(right, rel=1e-5)
-    alone = np.zeros_like(volume)
+    assert_adjoint(bricks, rng)
+    alone = np.zeros(bricks.shape, np.float32)
     alone[2, 1, 1] = 1.0
-    rows, columns, weights = bricks.column(2, 1, 1)
-    by_column = np.zeros_like(image)
-    by_column[rows, columns] = weights
-    np.testing.assert_allclose(by_column, bricks.forward(alone), atol=1e-8)
+    np.testing.assert_allclose(column_image(bricks, 2, 1, 1), bricks.forward(alone), atol=1e-8)
     # One ray in twelve goes to the next lens; a displaced row or half a pitch would move half of them and more.
-    off = [np.abs(bricks.forward(unit) - hexagons.forward(unit)).sum() for unit in units(volume, rng)]
+    off = [np.abs(bricks.forward(unit) - hexagons.forward(unit)).sum() for unit in units(alone, rng)]
     assert np.mean(off) < 2.0 / 12.0 + 0.05
     assert bricks.forward(alone).sum() == pytest.approx(1.0, abs=1e-3)
 
@@ -235,22 +212,13 @@ def test_bricks_need_an_upright_hexagonal_array(table2, water, lattice):
         factorise_bricks(replace(table2, lattice=lattice), water, GRID)
 
 
-RIG = {
-    "camera": {
-        "main_lens": {"magnification": -1.0, "focal_length_mm": 100.0, "aperture_mm": 25.0},
-        "microlenses": {"pitch_mm": 0.1, "focal_length_mm": 0.8, "layout": "hexagonal"},
-        "sensor": {"pixel_um": 5.5, "columns": 240, "rows": 200},
-    },
-    "media": {"air": 1.0, "window": 1.49, "fluid": 1.33},
-    "volume": {"shape_xyz": [5, 4, 3], "voxel_mm": [0.1, 0.1, 0.4]},
-    "reconstruction": {"padding_voxel": [0, 0, 0], "iterations": 5},
-}
+PLAIN = {"padding_voxel": [0, 0, 0], "iterations": 5}
+VOLUME = {"shape_xyz": [5, 4, 3], "voxel_mm": [0.1, 0.1, 0.4]}
 
 
-@pytest.fixture
-def rig(tmp_path):
-    path = tmp_path / "rig.yaml"
-    path.write_text(yaml.safe_dump(RIG))
+def rig_of(folder, volume=VOLUME, **sections):
+    path = folder / "rig.yaml"
+    path.write_text(table2_rig(240, 200, "hexagonal", volume=volume, reconstruction=PLAIN, **sections))
     return path
 
 
@@ -260,8 +228,8 @@ def build(path, *options):
     return output
 
 
-def test_a_hexagonal_rig_is_reconstructed_from_columns_on_demand(rig, tmp_path):
-    weights = open_weights(build(rig))
+def test_a_hexagonal_rig_is_reconstructed_from_columns_on_demand(tmp_path):
+    weights = open_weights(build(rig_of(tmp_path)))
     assert weights.weights.on_demand
     volume = np.zeros(weights.shape, np.float32)
     volume[1, 2, 3] = 1000.0
@@ -274,9 +242,8 @@ def test_a_hexagonal_rig_is_reconstructed_from_columns_on_demand(rig, tmp_path):
 
 
 @pytest.mark.thorough
-def test_counted_rays_share_the_file_format(rig):
-    small = yaml.safe_dump(RIG | {"weights": {"points": 400, "rays_per_point": 50}})
-    rig.write_text(small)
+def test_counted_rays_share_the_file_format(tmp_path):
+    rig = rig_of(tmp_path, weights={"points": 400, "rays_per_point": 50})
     counted = open_weights(build(rig, "--sampling", "rays"))
     assert not counted.weights.on_demand
     assert isinstance(open_weights(build(rig, "--overwrite")).weights.solver_operator, OnDemandOperator)
@@ -285,7 +252,7 @@ def test_counted_rays_share_the_file_format(rig):
     assert (rows.max(), columns.max()) < counted.image_shape
 
 
-def test_counting_too_many_rays_is_refused_with_its_cost(rig):
-    rig.write_text(yaml.safe_dump(RIG | {"volume": {"shape_xyz": [80, 80, 240], "voxel_mm": 0.1}}))
+def test_counting_too_many_rays_is_refused_with_its_cost(tmp_path):
+    rig = rig_of(tmp_path, {"shape_xyz": [80, 80, 240], "voxel_mm": 0.1})
     with pytest.raises(ConfigError, match="core hours"):
         build(rig, "--sampling", "rays")

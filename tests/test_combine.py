@@ -8,6 +8,7 @@ from numba import njit
 
 from benchmarks.simd import gains
 from benchmarks.weights import against_sparse_matrix, share_of_matrix_product_rate
+from lfpiv_cli import simd
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.media import Media
 from lfpiv_cli.simd import (
@@ -15,66 +16,32 @@ from lfpiv_cli.simd import (
     GROUP,
     LANES,
     TILE,
-    combine_line,
-    combine_long,
     combine_reference,
-    combine_turned,
     combine_turned_reference,
-    combine_turned_varying,
     combine_turned_varying_reference,
-    combine_varying,
     combine_varying_reference,
-    combine_vector,
     lanes_of,
-    turn,
     turn_reference,
 )
 from lfpiv_cli.weights.build import factorise
 
 
-@njit
-def long_lines(out, to, source, line, terms, share, shares):
-    combine_long(out, to, source, line, terms, share, shares)
-
-
-@njit
-def one_line(out, to, source, line, terms, share, shares):
-    combine_line(out, to, source, line, terms, share, shares)
-
-
-@njit
-def one_vector(out, to, source, line, terms, share, shares):
-    combine_vector(out, to, source, line, terms, share, shares)
-
-
-@njit
-def turned_lines(out, to, source, line, terms, share, share_at):
-    combine_turned(out, to, source, line, terms, share, share_at)
-
-
-@njit
-def turned_varying(out, to, source, line, terms, share, share_at, places, places_at):
-    combine_turned_varying(out, to, source, line, terms, share, share_at, places, places_at)
-
-
-@njit
-def varying(out, at, source, line, terms, share, share_at, places, places_at):
-    combine_varying(out, at, source, line, terms, share, share_at, places, places_at)
-
-
-@njit
-def turned_square(out, to, source, lines):
-    turn(out, to, source, lines)
+def compiled(name, arguments):
+    """Return a compiled function that calls an intrinsic with so many arguments: they are of kernels alone."""
+    names = ", ".join("abcdefghi"[:arguments])
+    scope = {"intrinsic": getattr(simd, name)}
+    exec(f"def call({names}): intrinsic({names})", scope)
+    return njit(scope["call"])
 
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("onto", [0, 3])
 @pytest.mark.parametrize("count", [0, 1, 7])
 @pytest.mark.parametrize(
-    ("compiled", "shape"), [(long_lines, (GROUP, TILE)), (one_line, (1, TILE)), (one_vector, (1, LANES))]
+    ("name", "shape"), [("combine_long", (GROUP, TILE)), ("combine_line", (1, TILE)), ("combine_vector", (1, LANES))]
 )
 @pytest.mark.parametrize(("term_step", "line_step"), [(GROUP, 1), (1, 11)])
-def test_combine_equals_its_reference(rng, compiled, shape, onto, count, term_step, line_step):
+def test_combine_equals_its_reference(rng, name, shape, onto, count, term_step, line_step):
     source = rng.standard_normal(12 * TILE, np.float32)
     share = rng.standard_normal(100, np.float32)
     line = rng.integers(0, 10, 9).astype(np.int32)
@@ -82,7 +49,7 @@ def test_combine_equals_its_reference(rng, compiled, shape, onto, count, term_st
     expected, found = start.copy(), start.copy()
     places = ((5, shape[1] + 3, onto), source, line, (TILE, TILE - 3, 2, count), share, (4, term_step, line_step))
     combine_reference(shape, expected, *places)
-    compiled(found, *places)
+    compiled(name, 7)(found, *places)
     # a fused multiply-add rounds once where the twin rounds twice
     np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6)
 
@@ -97,7 +64,7 @@ def test_combine_turned_equals_its_reference(rng, count):
     found[:] = expected
     places = ((2, step), source, line, (1, step, 2, count), share, LANES)
     combine_turned_reference(expected, *places)
-    turned_lines(found, *places)
+    compiled("combine_turned", 7)(found, *places)
     np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6)
 
 
@@ -112,23 +79,20 @@ def test_sums_with_varying_shares_equal_their_references(rng, count):
     found = expected.copy()
     arguments = source, line, (1, step, 2, count), share, LANES, places, 3
     combine_turned_varying_reference(expected, (2, step), *arguments)
-    turned_varying(found, (2, step), *arguments)
+    compiled("combine_turned_varying", 9)(found, (2, step), *arguments)
     np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6)
     combine_varying_reference(expected, 7, *arguments)
-    varying(found, 7, *arguments)
+    compiled("combine_varying", 9)(found, 7, *arguments)
     np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6)
 
 
-def test_turn_equals_its_reference(rng):
+def test_turn_equals_its_reference_in_lanes_of_the_processor(rng):
     step = LANES + 3
     source, expected = rng.standard_normal((2, step * LANES), np.float32)
     found = expected.copy()
     turn_reference(expected, (2, step), source, (1, step))
-    turned_square(found, (2, step), source, (1, step))
+    compiled("turn", 4)(found, (2, step), source, (1, step))
     np.testing.assert_array_equal(found, expected)
-
-
-def test_lanes_are_those_of_the_processor():
     assert lanes_of("+avx2,-avx512vl,+avx512f") == 16
     assert lanes_of("+avx2,-avx512f") == lanes_of("") == 8
 

@@ -49,51 +49,39 @@ def events(path: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in path.read_text().splitlines()]
 
 
-def test_without_a_terminal_each_frame_has_a_line_with_rate_and_time_left(clock, capsys) -> None:
+def test_without_a_terminal_lines_tell_rate_and_time_left(clock: Clock, capsys: pytest.CaptureFixture[str]) -> None:
     with Console().frames(3, 2, "reconstruct") as work:
         for name in "abc":
             work.advance(2)
             clock.now += 70.0
             work.done(name)
-    assert capsys.readouterr().err.splitlines() == [
-        "reconstruct: a, 1 of 3 frames, 70 s each, 2 min left",
-        "reconstruct: b, 2 of 3 frames, 70 s each, 1 min left",
-        "reconstruct: c, 3 of 3 frames, 70 s each, 0 s left",
-    ]
-
-
-def test_without_a_terminal_a_frame_that_takes_long_has_a_line_a_minute(clock, capsys) -> None:
+    # A frame that takes long has a line a minute; work of one piece one now and then.
     with Console().frames(2, 10, "reconstruct") as work:
         for _ in range(10):
             clock.now += 25.0
             work.advance(1)
         work.done("a")
-    assert capsys.readouterr().err.splitlines() == [
-        "reconstruct: 0.3 of 2 frames",
-        "reconstruct: 0.6 of 2 frames",
-        "reconstruct: 0.9 of 2 frames",
-        "reconstruct: a, 1 of 2 frames, 250 s each, 4 min left",
-    ]
-
-
-def test_without_a_terminal_work_of_one_piece_has_a_line_now_and_then(clock, capsys) -> None:
     with Console().progress(100, "refine") as advance:
         for _ in range(100):
             clock.now += 0.25
             advance(1)
     assert capsys.readouterr().err.splitlines() == [
+        "reconstruct: a, 1 of 3 frames, 70 s each, 2 min left",
+        "reconstruct: b, 2 of 3 frames, 70 s each, 1 min left",
+        "reconstruct: c, 3 of 3 frames, 70 s each, 0 s left",
+        "reconstruct: 0.3 of 2 frames",
+        "reconstruct: 0.6 of 2 frames",
+        "reconstruct: 0.9 of 2 frames",
+        "reconstruct: a, 1 of 2 frames, 250 s each, 4 min left",
         "refine: 40 of 100 steps, 4 a second, 15 s left",
         "refine: 80 of 100 steps, 4 a second, 5 s left",
     ]
-
-
-@pytest.mark.parametrize("silent", [Console(quiet=True), Console(only_warnings=True)])
-def test_who_asked_for_silence_has_it(silent: Console, clock: Clock, capsys) -> None:
-    with silent.frames(1, 1, "reconstruct") as work, silent.progress(1, "refine") as advance:
-        clock.now += 100.0
-        advance(1)
-        work.done("a")
-    assert capsys.readouterr().err == ""
+    for silent in (Console(quiet=True), Console(only_warnings=True)):
+        with silent.frames(1, 1, "reconstruct") as work, silent.progress(1, "refine") as advance:
+            clock.now += 100.0
+            advance(1)
+            work.done("a")
+        assert capsys.readouterr().err == ""
 
 
 def test_the_bar_counts_frames(monkeypatch, capsys) -> None:
@@ -121,15 +109,8 @@ def test_the_log_has_a_line_for_each_event_whatever_is_silent(clock: Clock, tmp_
     assert warning["code"] == "odd"
     memory = frame.pop("memory_mb")
     assert memory is None or 10.0 < memory < 1e5
-    assert frame | {"time": 0, "process": 0} == {
-        "time": 0,
-        "process": 0,
-        "command": "reconstruct",
-        "event": "frame",
-        "step": "reconstruct",
-        "name": "a",
-        "done": 1,
-        "of": 2,
+    told = {"command": "reconstruct", "event": "frame", "step": "reconstruct", "name": "a", "done": 1, "of": 2}
+    assert frame | {"time": 0, "process": 0} == told | dict.fromkeys(("time", "process"), 0) | {
         "seconds_each": 3.0,
         "seconds_left": 3.0,
     }
@@ -148,40 +129,28 @@ def test_a_log_is_added_to_and_nothing_else_is(tmp_path: Path) -> None:
         EventLog(tmp_path / "other" / "run.log", "track").write("start", {})
 
 
-def test_figures_of_several_methods_stand_in_columns(capsys) -> None:
-    Console().summary(
-        {"rms_u_voxel": {"volumes": 0.58, "particles": 0.049}, "bias": {"volumes": None, "particles": 1}, "pairs": 12}
-    )
-    assert [line.split() for line in capsys.readouterr().out.splitlines()] == [
-        ["volumes", "particles"],
-        ["rms_u_voxel", "0.58", "0.049"],
-        ["bias", "unknown", "1"],
-        ["pairs", "12"],
-    ]
-    Console().summary({"frames": 2, "sizes": [1, 2], "inputs": {"a": "x.tif"}})
-    assert [line.split(maxsplit=1)[1] for line in capsys.readouterr().out.splitlines()] == ["2", "1, 2", "a x.tif"]
-
-
-def test_figures_of_several_things_stand_in_a_table_that_is_longer_than_wide(capsys) -> None:
-    Console().summary(
-        {"voxels": 25, "a.ssim": 0.9, "a.l1": 0.1, "b.ssim": 0.8, "b.l1": None, "c.ssim": 1.0, "c.l1": 0.0}
-    )
-    assert [line.split() for line in capsys.readouterr().out.splitlines()] == [
-        ["voxels", "25"],
-        ["ssim", "l1"],
-        ["a", "0.9", "0.1"],
-        ["b", "0.8", "unknown"],
-        ["c", "1", "0"],
-    ]
-    Console().summary({"ideal.ert.x": 1.0, "ideal.ert.y": 2.0, "ideal.ert.z": 3.0, "flow.slope": 4.0})
-    assert [line.split() for line in capsys.readouterr().out.splitlines()] == [
-        ["ideal.ert"],
-        ["x", "1"],
-        ["y", "2"],
-        ["z", "3"],
-        ["slope"],
-        ["flow", "4"],
-    ]
+@pytest.mark.parametrize(
+    ("figures", "lines"),
+    [
+        (
+            {"rms_u": {"volumes": 0.58, "particles": 0.049}, "bias": {"volumes": None, "particles": 1}, "pairs": 12},
+            ["volumes particles", "rms_u 0.58 0.049", "bias unknown 1", "pairs 12"],
+        ),
+        ({"frames": 2, "sizes": [1, 2], "inputs": {"a": "x.tif"}}, ["frames 2", "sizes 1, 2", "inputs a x.tif"]),
+        # Of several things they stand in a table that is longer than wide.
+        (
+            {"voxels": 25, "a.ssim": 0.9, "a.l1": 0.1, "b.ssim": 0.8, "b.l1": None, "c.ssim": 1.0, "c.l1": 0.0},
+            ["voxels 25", "ssim l1", "a 0.9 0.1", "b 0.8 unknown", "c 1 0"],
+        ),
+        (
+            {"ideal.ert.x": 1.0, "ideal.ert.y": 2.0, "ideal.ert.z": 3.0, "flow.slope": 4.0},
+            ["ideal.ert", "x 1", "y 2", "z 3", "slope", "flow 4"],
+        ),
+    ],
+)
+def test_figures_are_tables(figures: dict[str, Any], lines: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    Console().summary(figures)
+    assert [" ".join(line.split()) for line in capsys.readouterr().out.splitlines()] == lines
 
 
 def command_that(act: Any) -> click.Command:
@@ -282,14 +251,11 @@ def test_an_error_is_json_on_stdout_with_the_same_code(monkeypatch, capsys, act,
     assert objects[0]["exit_code"] == code
 
 
-def test_a_command_line_that_is_not_understood_is_json_too(monkeypatch, capsys) -> None:
+def test_a_missed_limit_and_a_line_that_is_not_understood_are_json_too(monkeypatch, capsys) -> None:
     left, objects, said = ended(monkeypatch, capsys, failed, "--json", "--no-such-option")
     assert left == objects[0]["exit_code"] == 2
     assert "--no-such-option" in objects[0]["error"]
     assert "--no-such-option" in said
-
-
-def test_a_missed_limit_is_one_object_with_the_figures(monkeypatch, capsys) -> None:
     left, objects, _ = ended(monkeypatch, capsys, missed, "--json")
     assert left == 8
     assert [found.pop("warnings")[0]["code"] for found in objects] == ["odd"]

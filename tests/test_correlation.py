@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Flags, Floats, Singles
 from lfpiv_cli.errors import ConfigError, InputError
 from lfpiv_cli.flow.correlation import correlate, count_passes
-from lfpiv_cli.flow.deformation import (
-    SLACK,
-    SPLINE_PAD,
-    deform_pair,
-    spline_coefficients,
-    spline_matrix,
-)
+from lfpiv_cli.flow.deformation import SLACK, SPLINE_PAD, deform_pair, spline_coefficients, spline_matrix
 from lfpiv_cli.flow.field import MASKED, REJECTED, VectorField
 from lfpiv_cli.flow.peaks import find_peaks, vertex
 from lfpiv_cli.flow.sums import map_sums, margins
@@ -24,9 +20,11 @@ from lfpiv_cli.flow.windows import CorrelationSettings, layout_windows
 from lfpiv_cli.grid import Grid
 
 HALF = (0.5, 0.5, 0.5)
+MOVED = (1.3, -0.7, 0.4)
+COMMON = CorrelationSettings([(16, 16, 16)], HALF)
 # A corner's window has lost half of its 8 particles, and the faces cut others.
 CORNER = 0.1
-Flow = Callable[[NDArray[np.float64]], NDArray[np.float64]]
+Flow = Callable[[Floats], Floats]
 
 
 def unit_grid(shape_xyz: tuple[int, int, int]) -> Grid:
@@ -34,9 +32,7 @@ def unit_grid(shape_xyz: tuple[int, int, int]) -> Grid:
     return Grid(shape_xyz, (1.0, 1.0, 1.0), (0.0, 0.0, 0.0))
 
 
-def particle_volume(
-    centres: NDArray[np.float64], shape_xyz: tuple[int, int, int], sigma: tuple[float, float, float]
-) -> NDArray[np.float32]:
+def particle_volume(centres: Floats, shape_xyz: tuple[int, int, int], sigma: tuple[float, float, float]) -> Singles:
     """Gaussian particles (n, 3), in voxels, as a volume [z, y, x]."""
     profiles = [
         np.exp(-0.5 * ((np.arange(n)[:, np.newaxis] - centres[:, axis]) / s) ** 2)
@@ -51,7 +47,7 @@ def moving_pair(
     rng: np.random.Generator,
     per_window: float = 8.0,
     sigma: tuple[float, float, float] = (1.0, 1.0, 1.0),
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+) -> tuple[Singles, Singles]:
     """Two volumes half a displacement before and after; particles also beyond the faces, so that some come and go."""
     beyond = 8.0
     sides = np.array(shape_xyz) + 2 * beyond
@@ -60,7 +56,7 @@ def moving_pair(
     return particle_volume(centres - half, shape_xyz, sigma), particle_volume(centres + half, shape_xyz, sigma)
 
 
-def truth_at(field: VectorField, flow: Flow) -> NDArray[np.float64]:
+def truth_at(field: VectorField, flow: Flow) -> Floats:
     z, y, x = np.meshgrid(*(field.grid.axis_mm(axis) for axis in (2, 1, 0)), indexing="ij")
     points = np.stack([x, y, z], axis=-1)
     return flow(points.reshape(-1, 3)).reshape(points.shape)
@@ -70,15 +66,21 @@ def rigid(*shift: float) -> Flow:
     return lambda points: np.broadcast_to(np.array(shift), points.shape)
 
 
-def root_mean_square(error: NDArray[np.float64]) -> NDArray[np.float64]:
+def root_mean_square(error: Floats) -> Floats:
     return np.sqrt(np.mean(error**2, axis=(0, 1, 2)))
 
 
-def test_paper_s_volume_gives_twelve_by_sixteen_by_twelve_windows() -> None:
+def test_windows_are_centred_in_the_volume_and_give_the_paper_s_number() -> None:
     layout = layout_windows((100, 130, 100), (16, 16, 16), HALF)
     assert layout.count == (12, 16, 12)
     # 100 = 2 + 12 x 8 + 2 and 130 = 1 + 16 x 8 + 1: cells of 8 in the middle, windows 4 wider on both sides.
     assert layout.first == (-2, -3, -2)
+    # Grid of window centres is in millimetres.
+    volume = Grid.centred((100, 130, 100), (0.1, 0.1, 0.1), (1.0, 2.0, 3.0))
+    centres = layout_windows((100, 130, 100), (16, 16, 16), HALF).grid(volume)
+    for axis, middle in enumerate((1.0, 2.0, 3.0)):
+        assert np.mean(centres.axis_mm(axis)) == pytest.approx(middle)
+    assert centres.spacing_mm == pytest.approx((0.8, 0.8, 0.8))
 
 
 @pytest.mark.parametrize(("voxels", "size", "overlap"), [(100, 16, 0.5), (37, 16, 0.75), (50, 17, 0.5), (5, 16, 0.5)])
@@ -88,14 +90,6 @@ def test_windows_are_centred_in_the_volume(voxels: int, size: int, overlap: floa
     assert layout.count[0] == max(1, voxels // layout.step[0])
     # Windows start on whole voxels: an odd remainder shifts them by half a voxel.
     assert abs(0.5 * (centres[0] + centres[-1]) - 0.5 * (voxels - 1)) <= 0.5
-
-
-def test_grid_of_window_centres_is_in_millimetres() -> None:
-    volume = Grid.centred((100, 130, 100), (0.1, 0.1, 0.1), (1.0, 2.0, 3.0))
-    centres = layout_windows((100, 130, 100), (16, 16, 16), HALF).grid(volume)
-    for axis, middle in enumerate((1.0, 2.0, 3.0)):
-        assert np.mean(centres.axis_mm(axis)) == pytest.approx(middle)
-    assert centres.spacing_mm == pytest.approx((0.8, 0.8, 0.8))
 
 
 @pytest.mark.parametrize(("size", "overlap"), [((8, 8, 8), HALF), ((8, 7, 6), (0.75, 0.5, 0.0)), ((16, 12, 8), HALF)])
@@ -109,7 +103,7 @@ def test_maps_are_the_symmetric_normalised_correlation(
     padded_a, padded_b = np.pad(a, margin), np.pad(b, margin)
     maps = map_sums(padded_a, padded_b, layout, before, 2).correlation()
 
-    def window(volume: NDArray[np.float32], index: tuple[int, ...], shift: tuple[int, ...]) -> NDArray[np.float64]:
+    def window(volume: Singles, index: tuple[int, ...], shift: tuple[int, ...]) -> Floats:
         start = [
             layout.first[xyz] + k * layout.step[xyz] + s + m
             for xyz, k, s, m in zip((2, 1, 0), index, shift, before, strict=True)
@@ -128,7 +122,7 @@ def test_maps_are_the_symmetric_normalised_correlation(
         assert maps[index][tuple(s + 2 for s in shift)] == pytest.approx(expected, abs=1e-6)
 
 
-def test_peak_of_a_gaussian_is_exact() -> None:
+def test_peaks_of_gaussians_are_exact_and_second_ones_are_maxima_of_their_own() -> None:
     shifts = np.arange(-2, 3)
     place, width = np.array([0.3, -0.4, 0.2]), np.array([1.4, 1.2, 2.0])
     x, y, z = (np.exp(-0.5 * ((shifts - p) / w) ** 2) for p, w in zip(place, width, strict=True))
@@ -136,9 +130,7 @@ def test_peak_of_a_gaussian_is_exact() -> None:
     np.testing.assert_allclose(peaks.offset[0, 0, 0], place, atol=1e-12)
     np.testing.assert_allclose(peaks.width[0, 0, 0], width, rtol=1e-12)
     assert peaks.second_height[0, 0, 0] == 0.0
-
-
-def test_second_peak_is_a_maximum_of_its_own() -> None:
+    # Second peak is a maximum of its own.
     shifts = np.arange(-3, 4)
     first = np.exp(-0.5 * (shifts + 2) ** 2)
     second = 0.5 * np.exp(-0.5 * (shifts - 2) ** 2)
@@ -156,23 +148,20 @@ def test_peak_that_is_no_gaussian_stays_within_one_voxel(values: tuple[float, fl
     assert abs(place) <= 1.0
 
 
-def test_spline_matrix_is_exact_for_cubics_and_straight_beyond_the_nodes() -> None:
+def test_spline_matrix_is_exact_for_cubics_straight_beyond_the_nodes_and_constant_on_few() -> None:
     nodes = np.linspace(2.0, 20.0, 7)
     inside, outside = np.linspace(2.0, 20.0, 40), np.array([-1.0, 23.0])
     np.testing.assert_allclose(spline_matrix(nodes, inside) @ nodes**3, inside**3, rtol=1e-10)
     np.testing.assert_allclose(spline_matrix(nodes, outside) @ (2.0 * nodes), 2.0 * outside, rtol=1e-10)
     assert spline_matrix(nodes, np.array([23.0])) @ nodes**2 == pytest.approx(20.0**2 + 3.0 * 40.0)
-
-
-@pytest.mark.parametrize("count", [1, 2, 3])
-def test_spline_matrix_carries_constants_on_few_nodes(count: int) -> None:
-    matrix = spline_matrix(np.arange(count) * 8.0, np.arange(-4.0, 24.0))
-    np.testing.assert_allclose(matrix.sum(axis=1), 1.0, rtol=1e-12)
+    for count in (1, 2, 3):
+        matrix = spline_matrix(np.arange(count) * 8.0, np.arange(-4.0, 24.0))
+        np.testing.assert_allclose(matrix.sum(axis=1), 1.0, rtol=1e-12)
 
 
 def deformed(
-    a: NDArray[np.float32], b: NDArray[np.float32], mask: NDArray[np.bool_], shift: tuple[float, float, float]
-) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint8]]:
+    a: Singles, b: Singles, mask: Flags, shift: tuple[float, float, float]
+) -> tuple[Singles, Singles, NDArray[np.uint8]]:
     """Both volumes deformed by a uniform predictor."""
     along_z, along_y, along_x = (np.ones((n, 1), np.float32) for n in a.shape)
     field = np.array(shift).reshape(1, 1, 1, 3)
@@ -181,7 +170,7 @@ def deformed(
     return deform_pair(*splines, mask, field, (along_x, along_y, along_z), none, none)
 
 
-def test_deformation_brings_a_pair_together() -> None:
+def test_deformation_brings_a_pair_together_but_where_either_source_is_unseen() -> None:
     shape, shift = (24, 26, 22), (1.4, -0.6, 0.8)
     centre = np.array([[11.0, 13.0, 10.0]])
     half = 0.5 * np.array(shift)
@@ -190,6 +179,15 @@ def test_deformation_brings_a_pair_together() -> None:
     got_a, got_b, _ = deformed(a, b, np.zeros((0, 0, 0), dtype=np.bool_), shift)
     np.testing.assert_allclose(got_a / a.max() ** 0, middle / a.max(), atol=1e-3)
     np.testing.assert_allclose(got_b, middle / b.max(), atol=1e-3)
+    # Joint mask takes both volumes where either source is unseen.
+    a = np.ones((10, 11, 12), dtype=np.float32)
+    mask = np.ones(a.shape, dtype=np.bool_)
+    mask[:, :, 6:] = False
+    got_a, got_b, valid = deformed(a, a, mask, (4.0, 0.0, 0.0))
+    # Sources at x - 2 and x + 2 must both lie in 0 ... 5.
+    assert np.array_equal(np.flatnonzero(valid[5, 5]), [2, 3])
+    np.testing.assert_allclose(got_a[5, 5], valid[5, 5], atol=1e-5)
+    np.testing.assert_array_equal(got_a > 0.5, got_b > 0.5)
 
 
 def test_deformation_equals_the_spline_summed_by_hand_where_neighbours_move_apart(rng: np.random.Generator) -> None:
@@ -217,31 +215,18 @@ def test_deformation_equals_the_spline_summed_by_hand_where_neighbours_move_apar
     assert whole == pytest.approx(a[3, 3, 3] / a.max(), abs=1e-6)
 
 
-def cubic_spline(away: NDArray[np.float64]) -> NDArray[np.float64]:
+def cubic_spline(away: Floats) -> Floats:
     """The cubic B-spline, piece by piece."""
     s = np.abs(away)
     return np.where(s < 1, 2 / 3 - s**2 + s**3 / 2, np.where(s < 2, (2 - s) ** 3 / 6, 0.0))
 
 
-def test_joint_mask_takes_both_volumes_where_either_source_is_unseen() -> None:
-    a = np.ones((10, 11, 12), dtype=np.float32)
-    mask = np.ones(a.shape, dtype=np.bool_)
-    mask[:, :, 6:] = False
-    got_a, got_b, valid = deformed(a, a, mask, (4.0, 0.0, 0.0))
-    # Sources at x - 2 and x + 2 must both lie in 0 ... 5.
-    assert np.array_equal(np.flatnonzero(valid[5, 5]), [2, 3])
-    np.testing.assert_allclose(got_a[5, 5], valid[5, 5], atol=1e-5)
-    np.testing.assert_array_equal(got_a > 0.5, got_b > 0.5)
-
-
 @pytest.mark.thorough
 @pytest.mark.parametrize("shift", [(1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0), (2.3, -3.6, 0.7)])
-def test_rigid_shift_is_found_with_its_sign_up_to_the_borders(
-    shift: tuple[float, float, float], rng: np.random.Generator
-) -> None:
+def test_rigid_shift_is_found_up_to_the_borders(shift: tuple[float, float, float], rng: np.random.Generator) -> None:
     shape = (44, 52, 40)
     a, b = moving_pair(rigid(*shift), shape, rng)
-    field = correlate([(a, b)], unit_grid(shape), CorrelationSettings([(16, 16, 16)], HALF))
+    field = correlate([(a, b)], unit_grid(shape), COMMON)
     assert field.flag.max() == 0
     error = field.displacement_voxel - np.array(shift)
     # A face cuts particles of 8 per window; a corner's window has lost a third of its own.
@@ -254,13 +239,13 @@ def test_rigid_shift_is_found_with_its_sign_up_to_the_borders(
 def test_linear_shear_is_found_up_to_the_borders(rng: np.random.Generator) -> None:
     shape = (48, 48, 48)
 
-    def shear(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    def shear(points: Floats) -> Floats:
         moved = np.zeros(points.shape)
         moved[:, 0] = 0.08 * (points[:, 2] - 23.5)
         return moved
 
     a, b = moving_pair(shear, shape, rng)
-    field = correlate([(a, b)], unit_grid(shape), CorrelationSettings([(16, 16, 16)], HALF))
+    field = correlate([(a, b)], unit_grid(shape), COMMON)
     # The windows at the borders see one side of the shear only, and approach its value pass by pass.
     error = field.displacement_voxel - truth_at(field, shear)
     assert np.all(root_mean_square(error) < 0.06)
@@ -283,13 +268,13 @@ def test_elongated_particles_and_windows(rng: np.random.Generator) -> None:
 def test_long_particles_do_not_flatten_a_curved_flow(rng: np.random.Generator) -> None:
     shape = (40, 40, 96)
 
-    def wave(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    def wave(points: Floats) -> Floats:
         moved = np.zeros(points.shape)
         moved[:, 0] = 1.5 * np.cos(2.0 * np.pi * points[:, 2] / 96.0)
         return moved
 
     a, b = moving_pair(wave, shape, rng, per_window=40.0, sigma=(1.0, 1.0, 8.0))
-    field = correlate([(a, b)], unit_grid(shape), CorrelationSettings([(16, 16, 16)], HALF))
+    field = correlate([(a, b)], unit_grid(shape), COMMON)
     truth = truth_at(field, wave)
     inner = (slice(1, -1),) * 3
     slopes = [
@@ -303,7 +288,7 @@ def test_long_particles_do_not_flatten_a_curved_flow(rng: np.random.Generator) -
 
 @pytest.mark.thorough
 def test_roots_of_intensities_let_dim_particles_count(rng: np.random.Generator) -> None:
-    shape, shift = (40, 40, 40), (1.3, -0.7, 0.4)
+    shape, shift = (40, 40, 40), MOVED
     sharp = (0.5, 0.5, 0.5)
     dim, bright = (moving_pair(rigid(*shift), shape, rng, sigma=sharp, per_window=n) for n in (12.0, 0.3))
     a, b = (faint + np.float32(20.0) * strong for faint, strong in zip(dim, bright, strict=True))
@@ -327,28 +312,23 @@ def test_roots_of_intensities_let_dim_particles_count(rng: np.random.Generator) 
 def test_any_windows_and_overlap_work(
     windows: list[tuple[int, int, int]], overlap: tuple[float, float, float], rng: np.random.Generator
 ) -> None:
-    shape, shift = (40, 44, 36), (1.3, -0.7, 0.4)
+    shape, shift = (40, 44, 36), MOVED
     a, b = moving_pair(rigid(*shift), shape, rng)
     field = correlate([(a, b)], unit_grid(shape), CorrelationSettings(windows, overlap, 0.5))
     np.testing.assert_allclose(field.displacement_voxel, np.broadcast_to(shift, (*field.flag.shape, 3)), atol=0.03)
 
 
 @pytest.mark.thorough
-def test_exchanging_the_volumes_turns_the_vectors_round(rng: np.random.Generator) -> None:
+def test_exchanging_volumes_or_axes_turns_vectors_round(rng: np.random.Generator) -> None:
     shape = (40, 40, 40)
-    a, b = moving_pair(rigid(1.3, -0.7, 0.4), shape, rng)
-    there, back = (
-        correlate([pair], unit_grid(shape), CorrelationSettings([(16, 16, 16)], HALF)) for pair in ((a, b), (b, a))
-    )
+    a, b = moving_pair(rigid(*MOVED), shape, rng)
+    there, back = (correlate([pair], unit_grid(shape), COMMON) for pair in ((a, b), (b, a)))
     np.testing.assert_allclose(there.displacement_voxel, -back.displacement_voxel, atol=1e-4)
-
-
-@pytest.mark.thorough
-def test_exchanging_axes_exchanges_components(rng: np.random.Generator) -> None:
-    a, b = moving_pair(rigid(1.3, -0.7, 0.4), (40, 44, 36), rng)
-    straight = correlate([(a, b)], unit_grid((40, 44, 36)), CorrelationSettings([(16, 16, 16)], HALF))
+    # Exchanging axes exchanges components.
+    a, b = moving_pair(rigid(*MOVED), (40, 44, 36), rng)
+    straight = correlate([(a, b)], unit_grid((40, 44, 36)), COMMON)
     exchanged = np.ascontiguousarray(a.T), np.ascontiguousarray(b.T)
-    turned = correlate([exchanged], unit_grid((36, 44, 40)), CorrelationSettings([(16, 16, 16)], HALF))
+    turned = correlate([exchanged], unit_grid((36, 44, 40)), COMMON)
     back = turned.displacement_voxel.transpose(2, 1, 0, 3)[..., ::-1]
     np.testing.assert_allclose(straight.displacement_voxel, back, atol=1e-4)
 
@@ -360,17 +340,15 @@ def test_volumes_with_nothing_in_them_are_flagged() -> None:
     assert np.all(np.isnan(field.velocity))
     assert np.all(field.correlation == 0.0)
     assert np.all(field.valid_fraction > 0.4)
-
-
-def test_constant_volumes_have_finite_or_flagged_vectors() -> None:
+    # Constant volumes have finite or flagged vectors.
     grey = np.full((24, 24, 24), 7.0, dtype=np.float32)
     field = correlate([(grey, grey)], unit_grid((24, 24, 24)), CorrelationSettings([(16, 16, 16)], HALF, 1.0))
     assert np.all(np.isfinite(field.velocity[field.flag < REJECTED]))
 
 
 @pytest.mark.thorough
-def test_half_empty_volume_keeps_its_other_half(rng: np.random.Generator) -> None:
-    shape, shift = (64, 32, 32), (1.3, -0.7, 0.4)
+def test_what_is_masked_empty_or_not_finite_leaves_the_rest_unharmed(rng: np.random.Generator) -> None:
+    shape, shift = (64, 32, 32), MOVED
     a, b = moving_pair(rigid(*shift), shape, rng)
     a[:, :, 28:] = 0.0
     b[:, :, 28:] = 0.0
@@ -380,11 +358,7 @@ def test_half_empty_volume_keeps_its_other_half(rng: np.random.Generator) -> Non
     assert np.sqrt(np.mean(error**2)) < 0.5 * CORNER
     assert np.all(field.flag[:, :, -2:] == REJECTED)
     assert np.array_equal(np.isnan(field.velocity).any(axis=-1), field.flag >= REJECTED)
-
-
-@pytest.mark.thorough
-def test_masked_windows_are_masked_and_their_neighbours_unharmed(rng: np.random.Generator) -> None:
-    shape, shift = (64, 32, 32), (1.3, -0.7, 0.4)
+    # Masked windows are masked and their neighbours unharmed.
     a, b = moving_pair(rigid(*shift), shape, rng)
     mask = np.ones(a.shape, dtype=np.bool_)
     mask[:, :, 32:] = False
@@ -394,11 +368,8 @@ def test_masked_windows_are_masked_and_their_neighbours_unharmed(rng: np.random.
     assert np.all(field.flag[:, :, beyond] == MASKED)
     seen = field.flag < REJECTED
     np.testing.assert_allclose(field.displacement_voxel[seen], np.broadcast_to(shift, (seen.sum(), 3)), atol=CORNER)
-
-
-@pytest.mark.thorough
-def test_voxels_that_are_not_finite_are_masked(rng: np.random.Generator) -> None:
-    shape, shift = (40, 40, 40), (1.3, -0.7, 0.4)
+    # Voxels that are not finite are masked.
+    shape, shift = (40, 40, 40), MOVED
     a, b = moving_pair(rigid(*shift), shape, rng)
     a[20, 20, 20] = np.nan
     field = correlate([(a, b)], unit_grid(shape), CorrelationSettings([(16, 16, 16)], HALF, 1e-3))
@@ -407,34 +378,33 @@ def test_voxels_that_are_not_finite_are_masked(rng: np.random.Generator) -> None
 
 @pytest.mark.thorough
 def test_an_ensemble_finds_what_its_pairs_are_too_sparse_for(rng: np.random.Generator) -> None:
-    shape, shift = (40, 40, 40), (1.3, -0.7, 0.4)
+    shape, shift = (40, 40, 40), MOVED
     pairs = [moving_pair(rigid(*shift), shape, rng, per_window=1.0) for _ in range(12)]
-    together = correlate(iter(pairs), unit_grid(shape), CorrelationSettings([(16, 16, 16)], HALF))
-    single = correlate(pairs[:1], unit_grid(shape), CorrelationSettings([(16, 16, 16)], HALF))
+    together = correlate(iter(pairs), unit_grid(shape), COMMON)
+    single = correlate(pairs[:1], unit_grid(shape), COMMON)
     errors = [np.abs(field.displacement_raw_voxel - np.array(shift)) for field in (together, single)]
     assert np.all(errors[0] < 0.1)
     assert not np.all(errors[1] < 0.5)
     with pytest.raises(InputError):
-        correlate([], unit_grid(shape), CorrelationSettings([(16, 16, 16)], HALF))
+        correlate([], unit_grid(shape), COMMON)
 
 
 @pytest.mark.thorough
-def test_an_ensemble_of_one_pair_twice_is_that_pair(rng: np.random.Generator) -> None:
+def test_one_pair_twice_and_other_threads_change_nothing(
+    rng: np.random.Generator, one_thread: Callable[[], AbstractContextManager[None]]
+) -> None:
     shape = (32, 32, 32)
-    a, b = moving_pair(rigid(1.3, -0.7, 0.4), shape, rng)
-    once = correlate([(a, b)], unit_grid(shape), CorrelationSettings([(16, 16, 16)], HALF))
-    twice = correlate([(a, b), (a, b)], unit_grid(shape), CorrelationSettings([(16, 16, 16)], HALF))
+    a, b = moving_pair(rigid(*MOVED), shape, rng)
+    once = correlate([(a, b)], unit_grid(shape), COMMON)
+    twice = correlate([(a, b), (a, b)], unit_grid(shape), COMMON)
     np.testing.assert_allclose(twice.displacement_voxel, once.displacement_voxel, atol=1e-6)
     np.testing.assert_allclose(twice.correlation, once.correlation, atol=1e-6)
-
-
-@pytest.mark.thorough
-def test_threads_do_not_change_a_bit(rng: np.random.Generator, one_thread) -> None:
+    # Threads do not change a bit.
     shape = (40, 40, 40)
-    a, b = moving_pair(rigid(1.3, -0.7, 0.4), shape, rng)
-    parallel = correlate([(a, b)], unit_grid(shape), CorrelationSettings([(16, 16, 16)], HALF))
+    a, b = moving_pair(rigid(*MOVED), shape, rng)
+    parallel = correlate([(a, b)], unit_grid(shape), COMMON)
     with one_thread():
-        serial = correlate([(a, b)], unit_grid(shape), CorrelationSettings([(16, 16, 16)], HALF))
+        serial = correlate([(a, b)], unit_grid(shape), COMMON)
     assert parallel.displacement_voxel.tobytes() == serial.displacement_voxel.tobytes()
     assert parallel.peak_ratio.tobytes() == serial.peak_ratio.tobytes()
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.optics.camera import Camera, Lattice
 from lfpiv_cli.optics.curved_space import CurvedSpace, Face
 from lfpiv_cli.optics.media import Media, Window, fluid_path_to_focus
@@ -30,10 +32,8 @@ OUTER_MM, INNER_MM, APERTURE_MM = 7.0, 5.0, 12.5
 
 
 def tube(outer: float = OUTER_MM) -> CurvedSpace:
-    faces = [
-        (Cylinder((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), radius), index) for radius, index in ((outer, 1.49), (5.0, 1.33))
-    ]
-    return CurvedSpace(WATER, tuple(Face(*face) for face in faces))
+    walls = ((outer, 1.49), (INNER_MM, 1.33))
+    return CurvedSpace(WATER, tuple(Face(Cylinder((0.0,) * 3, (1.0, 0.0, 0.0), r), index) for r, index in walls))
 
 
 @pytest.fixture
@@ -43,7 +43,7 @@ def small(camera: Camera) -> Camera:
     return replace(camera, columns=150, rows=120, lattice=lattice, distortion_per_mm2=1e-3)
 
 
-def moved_light(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
+def moved_light(a: Floats, b: Floats) -> float:
     """Return the share of the light that lies in other pixels."""
     return float(np.abs(a - b).sum() / a.sum())
 
@@ -105,11 +105,19 @@ def test_fitted_slopes_are_right_where_they_say_so(camera: Camera, rng: np.rando
     assert fit_of_slopes()[1].shape == (TERMS, FITTED)
 
 
-def test_points_outside_the_fluid_are_dark_and_told(small: Camera, rng: np.random.Generator) -> None:
+def test_points_outside_the_fluid_are_dark_and_told_on_any_number_of_threads(
+    small: Camera, rng: np.random.Generator, one_thread: Callable[[], AbstractContextManager[None]]
+) -> None:
     points = np.array([[0.0, 0.0, 0.0], [0.0, 5.5, 0.0], [0.1, 0.0, -6.0], [0.0, 0.0, -9.0]])
     np.testing.assert_array_equal(unseen(small, tube(), points), [False, True, True, True])
     image = render_points(small, tube(), Balls(points[1:], 1.0, 0.05), rng, rays=100)
     assert not image.any()
+    # Same bits for any number of threads.
+    balls = Balls(np.array([[0.05, -0.1, 3.0], [-0.2, 0.1, -4.0], [0.0, 4.97, 0.0]]), 1.0, 0.05)
+    images = [render_points(small, tube(), balls, np.random.default_rng(5), rays=500)]
+    with one_thread():
+        images.append(render_points(small, tube(), balls, np.random.default_rng(5), rays=500))
+    np.testing.assert_array_equal(*images)
 
 
 def test_a_thin_wall_hides_what_no_ray_passes(camera: Camera) -> None:
@@ -133,11 +141,3 @@ def test_a_thin_wall_hides_what_no_ray_passes(camera: Camera) -> None:
     assert farthest < 4.3
     # places on the lens are not asked for its very rim
     assert r[hidden].min() == pytest.approx(farthest, abs=0.03)
-
-
-def test_same_bits_for_any_number_of_threads(small: Camera, one_thread) -> None:
-    balls = Balls(np.array([[0.05, -0.1, 3.0], [-0.2, 0.1, -4.0], [0.0, 4.97, 0.0]]), 1.0, 0.05)
-    images = [render_points(small, tube(), balls, np.random.default_rng(5), rays=500)]
-    with one_thread():
-        images.append(render_points(small, tube(), balls, np.random.default_rng(5), rays=500))
-    np.testing.assert_array_equal(*images)

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.names import ColumnAxis
 from lfpiv_cli.optics.camera import Camera
@@ -16,7 +16,7 @@ from lfpiv_cli.optics.media import Media, Window, fluid_path_to_focus
 from lfpiv_cli.optics.shapes import Vector
 from lfpiv_cli.optics.surfaces import Cylinder, Plane, Sphere, Surface, TiltedPlane
 from lfpiv_cli.optics.tracing import ObjectSpace, disc_points
-from tests.known_rays import rays_from_air, rays_to_air, slopes_exact
+from tests.known_rays import assert_rays_go_back, rays_from_air, rays_to_air, slopes_exact
 
 WATER = Media(1.0, 1.49, 1.33)
 # An acrylic tube: inner diameter 10 mm, wall 2 mm.
@@ -31,12 +31,12 @@ def stack(*faces: tuple[Surface, float], air: float = 1.0) -> CurvedSpace:
     return CurvedSpace(Media(air, 1.49, faces[-1][1]), tuple(Face(*face) for face in faces))
 
 
-def points_in_tube(rng: np.random.Generator, count: int, radius: float = 0.98 * INNER_MM) -> NDArray[np.float64]:
+def points_in_tube(rng: np.random.Generator, count: int, radius: float = 0.98 * INNER_MM) -> Floats:
     """Return points of a tube along x; in front of its rim, where light grazes, unless it is asked for."""
     return np.concatenate([rng.uniform(-6, 6, (count, 1)), disc_points(count, radius, rng)], axis=1)
 
 
-def aimed(space: CurvedSpace, camera: Camera, points: NDArray[np.float64], crossing: NDArray[np.float64]):
+def aimed(space: CurvedSpace, camera: Camera, points: Floats, crossing: Floats):
     slopes, valid = space.slopes(camera, points, crossing)
     assert valid.all()
     return slopes
@@ -51,7 +51,7 @@ def ray_at_point(space, camera, point, crossing):
     return slope[0], direction / np.linalg.norm(direction)
 
 
-def direction_in_air(slope: NDArray[np.float64]) -> NDArray[np.float64]:
+def direction_in_air(slope: Floats) -> Floats:
     """Return the direction towards the camera of a ray with slopes (2,): in z, -1 for each slope."""
     direction = np.array([*slope, -1.0])
     return direction / np.linalg.norm(direction)
@@ -81,23 +81,7 @@ def test_rays_go_back_the_way_they_came(table2, rng, column_axis: ColumnAxis, ti
     camera = replace(table2, column_axis=column_axis)
     axis = (1.0, tilt, -0.5 * tilt) if column_axis == "x" else (tilt, 1.0, -0.5 * tilt)
     space = tube(axis, (0.2, 0.1, 0.5))
-    points, crossing = points_in_tube(rng, 200, 3.0), disc_points(200, 12.5, rng)
-    slopes = aimed(space, camera, points, crossing)
-    places, valid = rays_from_air(space, camera, crossing, slopes, points[:, 2])
-    # a step of Newton's from 1e-6 mm
-    assert valid.all()
-    np.testing.assert_allclose(places, points[:, :2], atol=1e-12)
-    short, _ = rays_from_air(space, camera, crossing, slopes, points[:, 2] - 1e-3)
-    towards = np.concatenate([short - places, np.full((200, 1), -1e-3)], axis=1)
-    back, slopes_back, valid = rays_to_air(space, camera, points, towards)
-    # the direction by a difference of 1e-3 mm, of which 1e-15 are lost: 1e-12, over 200 mm
-    assert valid.all()
-    np.testing.assert_allclose(back, crossing, atol=1e-9)
-    np.testing.assert_allclose(slopes_back, slopes, atol=1e-11)
-    again, valid = rays_from_air(space, camera, back, slopes_back, points[:, 2])
-    # there and back in the same directions: roundings of 200 mm, of the slopes over as much, and of the rim's bending
-    assert valid.all()
-    np.testing.assert_allclose(again, points[:, :2], atol=1e-12)
+    assert_rays_go_back(space, camera, points_in_tube(rng, 200, 3.0), disc_points(200, 12.5, rng))
 
 
 @pytest.mark.parametrize("column_axis", ["x", "y"])
@@ -232,9 +216,8 @@ def twin(space, camera, crossing, slope, z):
     place, direction = np.array([*crossing, space.lens_z_mm(camera)]), -direction_in_air(slope)
     index = space.media.air
     for face in space.faces:
-        across = np.eye(3) - np.outer(face.surface.axis, face.surface.axis) / np.dot(
-            face.surface.axis, face.surface.axis
-        )
+        axis = np.array(face.surface.axis)
+        across = np.eye(3) - np.outer(axis, axis) / (axis @ axis)
         offset, moving = across @ (place - face.surface.centre_mm), across @ direction
         a, b, c = moving @ moving, 2 * offset @ moving, offset @ offset - face.surface.radius_mm**2
         if b**2 - 4 * a * c <= 0:
@@ -305,10 +288,7 @@ def test_rays_and_points_outside_the_fluid_are_flags(table2):
     [
         ((), "at least one face"),
         ((Face(Plane(-2.0), 1.49),), "behind the last face the index is 1.49, not the fluid's 1.33"),
-        (
-            (Face(Plane(-2.0), 1.49), Face(Plane(-3.0), 1.33)),
-            "face 2 meets the optical axis at z = -3 mm, face 1 at -2",
-        ),
+        ((Face(Plane(-2.0), 1.49), Face(Plane(-3.0), 1.33)), "face 2 meets the optical axis at z = -3 mm, face 1 at"),
         ((Face(Cylinder((0, 9, 0), (1, 0, 0), 5.0), 1.33),), "misses the cylinder"),
     ],
 )

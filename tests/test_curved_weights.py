@@ -8,10 +8,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 import tifffile
-import yaml
-from numba import get_num_threads, set_num_threads
-from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Floats, Singles
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.files.config import Config
 from lfpiv_cli.files.hdf5 import read_tree, write_tree
@@ -44,28 +42,20 @@ from lfpiv_cli.weights.strips import (
     mixed_shares,
     strip_rays,
 )
+from tests.commands import table2_rig
+from tests.operators import assert_adjoint, column_image
 
 VOXEL = (0.1, 0.1, 0.1)
 # Tiles across the aperture: with as many a column's own error is far below what chance makes of a count.
 FINE = 64
 # All over the part of the tube that the sensor sees: near its middle, beside it, near both walls, off the focal plane.
-PLACES = [
-    (0.05, 0.05, 0.05),
-    (1.05, 0.55, 3.05),
-    (-2.05, 2.05, -4.05),
-    (3.05, -3.05, 2.05),
-    (2.55, 3.45, -2.55),
-    (1.05, -3.45, 0.05),
-    (-3.05, 3.05, 1.95),
-    (2.05, -3.35, -1.95),
-    (-1.05, -2.05, 4.35),
-    (0.55, 0.05, -4.85),
-]
+PLACES = [(0.05, 0.05, 0.05), (1.05, 0.55, 3.05), (-2.05, 2.05, -4.05), (3.05, -3.05, 2.05), (2.55, 3.45, -2.55)]
+PLACES += [(1.05, -3.45, 0.05), (-3.05, 3.05, 1.95), (2.05, -3.35, -1.95), (-1.05, -2.05, 4.35), (0.55, 0.05, -4.85)]
 # Beside the axis of a tube along x, up to the wall and beyond it.
 BESIDE = Grid.centred((4, 20, 7), (0.1, 0.1, 0.4), (0.6, 2.6, 2.6))
 
 
-def forward_reference(operator: StripOperator, volume: NDArray[np.float32]) -> NDArray[np.float64]:
+def forward_reference(operator: StripOperator, volume: Singles) -> Floats:
     """Return the image of a volume voxel by voxel: the readable twin of `StripOperator.forward`."""
     image = np.zeros(operator.image_shape)
     for index in np.ndindex(*operator.shape):
@@ -74,7 +64,7 @@ def forward_reference(operator: StripOperator, volume: NDArray[np.float32]) -> N
     return image
 
 
-def adjoint_reference(operator: StripOperator, image: NDArray[np.float32]) -> NDArray[np.float64]:
+def adjoint_reference(operator: StripOperator, image: Singles) -> Floats:
     """Return the adjoint voxel by voxel: the readable twin of `StripOperator.adjoint`."""
     volume = np.zeros(operator.shape)
     for index in np.ndindex(*operator.shape):
@@ -90,20 +80,8 @@ def tube(water):
 
 
 def tube_along(axis, media):
-    return CurvedSpace(
-        media,
-        (
-            Face(Cylinder((0.0, 0.0, 0.0), axis, 7.0), media.window),
-            Face(Cylinder((0.0, 0.0, 0.0), axis, 5.0), media.fluid),
-        ),
-    )
-
-
-def column_of(operator, index):
-    image = np.zeros(operator.image_shape)
-    rows, columns, weights = operator.column(*index)
-    image[rows, columns] = weights
-    return image
+    walls = ((7.0, media.window), (5.0, media.fluid))
+    return CurvedSpace(media, tuple(Face(Cylinder((0.0, 0.0, 0.0), axis, radius), index) for radius, index in walls))
 
 
 def differences_from_counts(camera, space, places, rays):
@@ -166,7 +144,7 @@ def test_plane_faces_have_the_weights_of_plane_layers(table2, water, window, pla
     assert strips.blocks.plane.size == 1  # one strip, one part
     for index in np.ndindex(*whole.shape):
         # Means over the aperture and the voxels against a fit through them.
-        assert np.abs(column_of(strips, index) - column_of(whole, index)).sum() < 0.005
+        assert np.abs(column_image(strips, *index) - column_image(whole, *index)).sum() < 0.005
 
 
 @pytest.mark.thorough
@@ -179,15 +157,13 @@ def test_strips_are_adjoint_and_light_what_columns_say(table2, water, rng, colum
     assert isinstance(operator, StripOperator)
     assert operator.turned == ((column_axis == "x") != bool(axis[0]))
     weights = Weights(grid, (0, 0, 0), operator, column_axis)
-    volume, image = rng.random(weights.shape, np.float32), rng.random(weights.image_shape, np.float32)
-    left = np.vdot(weights.forward(volume).astype(np.float64), image)
-    assert left == pytest.approx(np.vdot(volume.astype(np.float64), weights.adjoint(image)), rel=1e-5)
+    assert_adjoint(weights, rng)
     layout = OnDemandOperator(camera, tube_along(axis, water), grid)
     errors = []
     for index in list(np.ndindex(*operator.shape))[::41]:
         alone = np.zeros(operator.shape, np.float32)
         alone[index] = 1.0
-        column = column_of(operator, index)
+        column = column_image(operator, *index)
         np.testing.assert_allclose(operator.forward(alone), column, atol=1e-8)
         centre = layout.centres_mm(np.array([np.ravel_multi_index(index, operator.shape)]))
         converged = integrate_columns(camera, layout.source, centre, layout.sides_mm, 128, 5)
@@ -198,7 +174,7 @@ def test_strips_are_adjoint_and_light_what_columns_say(table2, water, rng, colum
     assert operator.misfit_l1.max() == pytest.approx(np.max(errors), abs=0.008)  # what it says of itself
 
 
-def test_strips_are_the_sum_of_their_columns(table2, tube, rng):
+def test_strips_are_the_sum_of_their_columns(table2, tube, rng, one_thread):
     camera = replace(table2, columns=400)
     operator = operator_of(camera, tube, BESIDE)
     volume, image = rng.random(operator.shape, np.float32), rng.random(operator.image_shape, np.float32)
@@ -206,14 +182,9 @@ def test_strips_are_the_sum_of_their_columns(table2, tube, rng):
     assert operator.blocks.plane.size > np.unique(operator.blocks.line).size  # parts of the aperture
     np.testing.assert_allclose(operator.forward(volume), forward_reference(operator, volume), rtol=1e-4, atol=1e-5)
     np.testing.assert_allclose(operator.adjoint(image), adjoint_reference(operator, image), rtol=1e-4, atol=1e-5)
-    with_threads = operator.forward(volume), operator.adjoint(image)
-    threads = get_num_threads()
-    set_num_threads(1)
-    try:
+    with one_thread():
         alone = operator.forward(volume), operator.adjoint(image)
-    finally:
-        set_num_threads(threads)
-    for one, other in zip(with_threads, alone, strict=True):
+    for one, other in zip((operator.forward(volume), operator.adjoint(image)), alone, strict=True):
         np.testing.assert_array_equal(one, other)
 
 
@@ -227,16 +198,14 @@ def test_strips_follow_a_tube_that_runs_a_little_aslant(table2, water, rng, monk
     grid = Grid.centred((32, 20, 5), (0.1, 0.1, 0.4), (0.6, 2.6, 2.6))
     operator = operator_of(camera, tube, grid)
     assert isinstance(operator, StripOperator)
-    volume, image = rng.random(operator.shape, np.float32), rng.random(operator.image_shape, np.float32)
-    left = np.vdot(operator.forward(volume).astype(np.float64), image)
-    assert left == pytest.approx(np.vdot(volume.astype(np.float64), operator.adjoint(image)), rel=1e-5)
+    assert_adjoint(operator, rng)
     layout = OnDemandOperator(camera, tube, grid)
     errors = []
     for flat in np.flatnonzero(operator.lit)[::97]:
         index = np.unravel_index(flat, operator.shape)
         alone = np.zeros(operator.shape, np.float32)
         alone[index] = 1.0
-        column = column_of(operator, [int(k) for k in index])
+        column = column_image(operator, *(int(k) for k in index))
         np.testing.assert_allclose(operator.forward(alone), column, atol=1e-8)
         converged = integrate_columns(camera, tube, layout.centres_mm(np.array([flat])), layout.sides_mm, 128, 5)
         errors.append(np.abs(column - converged.image(0, operator.image_shape)).sum())
@@ -256,25 +225,23 @@ def test_factors_are_mixed_linearly_between_their_places():
     np.testing.assert_allclose(shares.sum(axis=1), 1.0)
     np.testing.assert_allclose(shares @ (3.0 * places + 1.0), 3.0 * along + 1.0)
     np.testing.assert_array_equal(mixed_shares(np.array([-9.0, 9.0]), places), [[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-
-
-@pytest.mark.thorough
-def test_strips_meet_at_their_seams(table2, tube):
-    operator = operator_of(table2, tube, BESIDE)
-    # The light over the sensor's columns, which changes with the depth that the line of voxels is seen at.
-    profiles = [column_of(operator, (1, line, 2)).sum(axis=0) for line in range(operator.shape[1])]
-    steps = [np.abs(one - other).sum() for one, other in pairwise(profiles)]
-    seam = STRIP - 1
-    assert steps[seam] < 1.2 * max(steps[seam - 1], steps[seam + 1]) + 0.01
-
-
-def test_points_fill_the_cube_evenly():
+    # Points fill the cube evenly.
     for count in (100, 1000):
         points = evenly_spread(count, 3)
         boxes, _ = np.histogramdd(points, 4, [(0.0, 1.0)] * 3)
         assert boxes.sum() == count
         # Of random ones the mean square would be `count / 64`.
         assert np.mean((boxes - count / 64) ** 2) < 0.5 * count / 64
+
+
+@pytest.mark.thorough
+def test_strips_meet_at_their_seams(table2, tube):
+    operator = operator_of(table2, tube, BESIDE)
+    # The light over the sensor's columns, which changes with the depth that the line of voxels is seen at.
+    profiles = [column_image(operator, 1, line, 2).sum(axis=0) for line in range(operator.shape[1])]
+    steps = [np.abs(one - other).sum() for one, other in pairwise(profiles)]
+    seam = STRIP - 1
+    assert steps[seam] < 1.2 * max(steps[seam - 1], steps[seam + 1]) + 0.01
 
 
 def test_fits_of_a_strip_follow_its_rays(table2, tube):
@@ -312,9 +279,8 @@ def test_voxels_outside_the_fluid_stay_dark(table2, tube, rng):
         assert not operator.forward((~inside).astype(np.float32)).any()
     strips = operator_of(camera, tube, grid)
     for solver in ("sart", "em"):
-        found = reconstruct(
-            strips, strips.forward(rng.random(grid.shape_zyx, np.float32)), SolverSettings(solver, 3, 1.0)
-        )
+        image = strips.forward(rng.random(grid.shape_zyx, np.float32))
+        found = reconstruct(strips, image, SolverSettings(solver, 3, 1.0))
         assert np.isfinite(found.volume).all()
         assert not found.volume[~inside].any()
         assert found.volume[inside].any()
@@ -332,9 +298,7 @@ def test_what_does_not_separate_is_made_on_demand(table2, tube, water):
 @pytest.mark.parametrize("operator_kind", ["strips", "on demand"])
 def test_a_weights_file_holds_them(table2, tube, tmp_path, operator_kind):
     camera = replace(table2, columns=300)
-    operator = (
-        operator_of(camera, tube, BESIDE) if operator_kind == "strips" else OnDemandOperator(camera, tube, BESIDE)
-    )
+    operator = {"strips": operator_of, "on demand": OnDemandOperator}[operator_kind](camera, tube, BESIDE)
     path = tmp_path / "weights.h5"
     content = WeightsFile(Weights(BESIDE, (0, 0, 0), operator, "x"), camera, Reference("focal_point", 0.0), {})
     write_weights(path, content, False)
@@ -375,9 +339,8 @@ def test_strips_that_contradict_themselves_are_refused(table2, tube, tmp_path, g
     write_weights(path, WeightsFile(weights, camera, Reference("focal_point", 0.0), {}), False)
     tree, provenance = read_tree(path, FORMAT, (VERSION,))
     tree[group][name] = tree[group][name] + int(value.split()[-1]) if isinstance(value, str) else value
-    write_tree(
-        edited, tree, format_name=FORMAT, format_version=VERSION, provenance=provenance, overwrite=False, units=UNITS
-    )
+    form = {"format_name": FORMAT, "format_version": VERSION, "units": UNITS}
+    write_tree(edited, tree, **form, provenance=provenance, overwrite=False)
     with pytest.raises(InputError, match="not a whole weights file"):
         open_weights(edited)
 
@@ -425,24 +388,10 @@ def test_padding_reaches_as_light_spreads_and_ends_with_the_fluid(table2, tube, 
 def test_rays_made_for_a_voxel_follow_the_traced_ones(table2, tube):
     grid = Grid.centred((60, 100, 100), VOXEL, (0.0, 0.0, 0.0))
     assert aimed_misfit_mm(table2, tube, grid) < 1e-5
-
-
-def test_what_is_out_of_the_fluid_does_not_count_as_out_of_view(table2, tube):
+    # What is out of the fluid does not count as out of view.
     smallest, largest = seen_share(table2, tube, Grid.centred((20, 50, 100), VOXEL, (0.0, 0.0, 0.0)))
     assert 0.9 < smallest <= largest < 1.01
     assert seen_share(table2, tube, Grid.centred((2, 2, 2), VOXEL, (0.0, 6.0, 0.0))) == (0.0, 0.0)
-
-
-RIG = {
-    "camera": {
-        "main_lens": {"magnification": -1.0, "focal_length_mm": 100.0, "aperture_mm": 25.0},
-        "microlenses": {"pitch_mm": 0.1, "focal_length_mm": 0.8, "layout": "square"},
-        "sensor": {"pixel_um": 5.5, "columns": 360, "rows": 1200},
-    },
-    "media": {"air": 1.0, "window": 1.49, "fluid": 1.33},
-    "volume": {"shape_xyz": [6, 20, 6], "voxel_mm": [0.1, 0.1, 0.5], "centre_mm": [0.0, 1.5, 3.5]},
-    "reconstruction": {"solver": "em", "iterations": 30},
-}
 
 
 @pytest.mark.thorough
@@ -450,7 +399,9 @@ RIG = {
 def test_a_volume_behind_a_tube_is_reconstructed(tube, tmp_path, monkeypatch, layout):
     monkeypatch.setattr(Config, "object_space", lambda *_: tube)
     rig, output = tmp_path / "rig.yaml", tmp_path / "weights.h5"
-    rig.write_text(yaml.safe_dump(RIG).replace("square", layout))
+    volume = {"shape_xyz": [6, 20, 6], "voxel_mm": [0.1, 0.1, 0.5], "centre_mm": [0.0, 1.5, 3.5]}
+    solver = {"solver": "em", "iterations": 30}
+    rig.write_text(table2_rig(360, 1200, layout, volume=volume, reconstruction=solver))
     told = build_weights_file(rig, output)
     weights = open_weights(output)
     assert told["voxels_outside_fluid"] == weights.weights.voxels_outside_fluid > 0

@@ -110,9 +110,7 @@ def test_shares_time_limits_and_errors_of_other_kinds(in_process: str, tmp_path:
         work(Full(tmp_path, 4), in_process, keep_going=True)
 
 
-def test_an_address_where_nobody_is_and_a_missing_library_are_told(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_address_where_nobody_is_and_no_library_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from lfpiv_cli.verbs import distributed as stage
 
     monkeypatch.setattr(stage, "CONNECT_S", 0.2)

@@ -25,6 +25,7 @@ import tifffile
 from click.testing import CliRunner
 
 import lfpiv_cli
+from benchmarks.__main__ import BENCHMARKS
 from lfpiv_cli.cli.main import cli
 from lfpiv_cli.errors import LimitMissedError
 from lfpiv_cli.files import calibration_file, particle_file, vtkhdf, weights_file
@@ -38,9 +39,8 @@ from lfpiv_cli.files.particle_file import (
 )
 from lfpiv_cli.files.vtkhdf import VECTORS_FORMAT, VOLUME_FORMAT
 from tests import camera_files
+from tests.commands import ROOT, SAMPLE
 
-ROOT = Path(__file__).parent.parent
-SAMPLE = ROOT / "sample_data"
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
 MAKEFILE = (ROOT / "Makefile").read_text()
 
@@ -71,14 +71,14 @@ def commands_that_begin_with(program: str) -> Iterator[tuple[Path, str]]:
 LFPIV = list(commands_that_begin_with("lfpiv"))
 
 
-def test_there_are_commands_to_test():
+def test_there_are_commands_to_test() -> None:
     assert len(LFPIV) > 40
     assert {page.name for page, _ in LFPIV} >= {"README.md", "start.md", "your-rig.md", "batches.md"}
 
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("command", sorted({command for _, command in LFPIV}))
-def test_every_command_is_understood(command):
+def test_every_command_is_understood(command) -> None:
     # As a shell does: what follows a pipe, or a file that is written, is not the command's.
     words = list(itertools.takewhile(lambda word: word not in "|>", shlex.split(command)[1:]))
     before = list(itertools.takewhile(lambda word: word.startswith("-"), words))
@@ -89,7 +89,7 @@ def test_every_command_is_understood(command):
 
 
 @pytest.mark.parametrize("command", sorted({command for _, command in commands_that_begin_with("make")}))
-def test_every_make_is_understood(command):
+def test_every_make_is_understood(command) -> None:
     _, *words = shlex.split(command)
     targets = [word for word in words if "=" not in word]
     phony = re.search(r"^\.PHONY: (.+)$", MAKEFILE, re.MULTILINE)
@@ -99,54 +99,37 @@ def test_every_make_is_understood(command):
         assert re.search(rf"^{variable} \?=", MAKEFILE, re.MULTILINE), variable
 
 
-@pytest.mark.parametrize(
-    "command", sorted({command for _, command in commands_that_begin_with("python -m benchmarks")})
-)
-def test_every_benchmark_exists(command):
-    from benchmarks.__main__ import BENCHMARKS
-
-    assert set(command.split()[3:]) - {"NAME"} <= set(BENCHMARKS)
-
-
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_every_link_leads_somewhere(page):
-    for target in re.findall(r"\]\((?!https?:)([^)#]+)\)", page.read_text(encoding="utf-8")):
-        assert (page.parent / target).exists(), target
+def test_every_benchmark_exists() -> None:
+    for _, command in commands_that_begin_with("python -m benchmarks"):
+        assert set(command.split()[3:]) - {"NAME"} <= set(BENCHMARKS), command
 
 
 PLACE = re.compile(r"`((?:lfpiv_cli|tests|configs|benchmarks)/[\w/.-]*)`")
+PRIVATE = re.compile(r"told apart|untold|foretold|glance|\bdoubts\b|jumping", re.IGNORECASE)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_every_file_that_is_named_exists(page):
-    for place in PLACE.findall(page.read_text(encoding="utf-8")):
+def test_links_and_files_that_are_named_exist_and_words_are_plain(page) -> None:
+    text = page.read_text(encoding="utf-8")
+    for target in re.findall(r"\]\((?!https?:)([^)#]+)\)", text):
+        assert (page.parent / target).exists(), target
+    for place in PLACE.findall(text):
         assert (ROOT / place).exists(), place
+    assert not PRIVATE.search(text)
 
 
-def test_architecture_names_every_part_of_the_package():
-    page = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8").split("## Walks", 1)[0]
+def test_architecture_and_glossary_name_parts_of_the_package() -> None:
+    parts_of, walks = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8").split("## Walks", 1)
     package = ROOT / "lfpiv_cli"
     parts = {path.stem for path in package.glob("*.py")} | {path.parent.name for path in package.glob("*/__init__.py")}
-    assert {part for part in parts if f"`{part}`" not in page} == {"__init__", "__main__"}
-
-
-def test_walks_through_the_architecture_name_modules():
-    walks = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8").split("## Walks", 1)[1]
+    assert {part for part in parts if f"`{part}`" not in parts_of} == {"__init__", "__main__"}
     named = set(re.findall(r"`(\w+/[\w/]+)`", walks))
     assert len(named) > 40
-    assert {name for name in named if not (ROOT / "lfpiv_cli" / f"{name}.py").exists()} == set()
-
-
-def test_the_glossary_names_parts_of_the_package():
-    rows = [
-        line.split(" | ") for line in (ROOT / "docs" / "glossary.md").read_text().splitlines() if line.startswith("| ")
-    ]
+    assert {name for name in named if not (package / f"{name}.py").exists()} == set()
+    rows = [line.split(" | ") for line in (ROOT / "docs" / "glossary.md").read_text().splitlines() if line[:2] == "| "]
     named = {name for row in rows for name in re.findall(r"`(\w+)`", row[-1])}
     assert len(named) > 10
-    assert {name for name in named if not list((ROOT / "lfpiv_cli").glob(f"{name}*"))} == set()
-
-
-def test_readme_is_short():
+    assert {name for name in named if not list(package.glob(f"{name}*"))} == set()
     assert len((ROOT / "README.md").read_text().splitlines()) <= 80
 
 
@@ -163,7 +146,6 @@ TERMS = {
     "false vectors": "correlate",
     "seeding density": "simulate",
 }
-PRIVATE = re.compile(r"told apart|untold|foretold|glance|\bdoubts\b|jumping", re.IGNORECASE)
 
 
 def help_of(name: str) -> str:
@@ -174,19 +156,14 @@ def help_of(name: str) -> str:
 
 
 @pytest.mark.parametrize("term", TERMS)
-def test_help_and_documents_use_the_term_of_the_field(term):
+def test_help_and_documents_use_the_term_of_the_field(term) -> None:
     assert term in help_of(TERMS[term])
     assert any(term in " ".join(page.read_text(encoding="utf-8").split()) for page in PAGES)
 
 
 @pytest.mark.parametrize("name", cli.list_commands(click.Context(cli)))
-def test_help_uses_plain_words(name):
+def test_help_uses_plain_words(name) -> None:
     assert not PRIVATE.search(help_of(name))
-
-
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_pages_use_plain_words(page):
-    assert not PRIVATE.search(page.read_text(encoding="utf-8"))
 
 
 # --- what is longer: the commands themselves
@@ -211,8 +188,9 @@ def run(command: str) -> None:
         cli.main([*arguments, "--quiet"], standalone_mode=False)
 
 
-def changed(text: str, *changes: tuple[str, str]) -> str:
-    """Return a config's text with pieces of it replaced, each of which must be there."""
+def changed(name: str, *changes: tuple[str, str]) -> str:
+    """Return the text of a shipped config with pieces of it replaced, each of which must be there."""
+    text = (ROOT / "configs" / f"{name}.yaml").read_text()
     for old, new in changes:
         assert old in text, old
         text = text.replace(old, new)
@@ -238,13 +216,13 @@ def write_images(folder: Path) -> None:
 
 def write_configs(folder: Path) -> None:
     """Write the sample's config as `rig.yaml`, and small ones in place of those of the paper's size."""
-    sample, table2 = ((ROOT / "configs" / f"{name}.yaml").read_text() for name in ("sample", "table2"))
+    sample = changed("sample")
     (folder / "rig.yaml").write_text(sample)
     (folder / "configs").mkdir()
     for source in (ROOT / "configs").glob("*.yaml"):
         (folder / "configs" / source.name).write_text(f"{sample}  flow_methods: [volumes]\n")
     small = changed(
-        table2,
+        "table2",
         ("columns: 2352", "columns: 520"),
         ("rows: 1768", "rows: 520"),
         ("shape_xyz: [80, 80, 240]", "shape_xyz: [24, 24, 30]"),
@@ -257,7 +235,7 @@ def write_configs(folder: Path) -> None:
     for name in ("table2", "board"):
         (folder / "configs" / f"{name}.yaml").write_text(small)
     pipe = changed(
-        (ROOT / "configs" / "pipe.yaml").read_text(),
+        "pipe",
         ("columns: 2352, rows: 1768", "columns: 600, rows: 500"),
         ("shape_xyz: [100, 100, 100]", "shape_xyz: [20, 24, 24]"),
         ("windows: [32, 16]", "windows: [8]"),
@@ -301,7 +279,7 @@ def furnished(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("page", [page for page in PAGES if chain_of(page)], ids=lambda page: page.name)
-def test_every_command_runs(page, furnished, tmp_path):
+def test_every_command_runs(page, furnished, tmp_path) -> None:
     shutil.copytree(furnished, tmp_path, dirs_exist_ok=True)
     with contextlib.chdir(tmp_path):
         for command in chain_of(page):
@@ -309,7 +287,7 @@ def test_every_command_runs(page, furnished, tmp_path):
 
 
 @pytest.mark.slow
-def test_the_python_page_runs(furnished, capsys):
+def test_the_python_page_runs(furnished, capsys) -> None:
     blocks = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "python.md").read_text(), re.DOTALL)
     with contextlib.chdir(furnished):
         exec(compile("\n".join(blocks), "docs/python.md", "exec"), {})
@@ -318,7 +296,7 @@ def test_the_python_page_runs(furnished, capsys):
     assert "valid vectors" in printed
 
 
-def test_the_python_page_uses_what_is_promised():
+def test_the_python_page_uses_what_is_promised() -> None:
     page = (ROOT / "docs" / "python.md").read_text()
     assert set(re.findall(r"\blf\.(\w+)", page)) <= set(lfpiv_cli.__all__)
 
@@ -345,7 +323,7 @@ VERSIONS = {
 }
 
 
-def test_versions_of_formats_are_those_that_are_written_and_read():
+def test_versions_of_formats_are_those_that_are_written_and_read() -> None:
     page = (ROOT / "docs" / "files.md").read_text(encoding="utf-8")
     found = re.findall(r"`(lfpiv-\w+)`, version (\d+)(?: \(([\d, and]+) are read\))?", page)
     named = {name: [int(number), *map(int, re.findall(r"\d+", others))] for name, number, others in found}
@@ -392,11 +370,11 @@ def unnamed(path: Path, sections: tuple[int, ...]) -> list[str]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SPECIFIED)
-def test_files_hold_nothing_that_is_not_specified(furnished, name):
+def test_files_hold_nothing_that_is_not_specified(furnished, name) -> None:
     assert unnamed(furnished / name, SPECIFIED[name]) == []
 
 
-def test_a_member_that_is_not_specified_is_found(tmp_path):
+def test_a_member_that_is_not_specified_is_found(tmp_path) -> None:
     with h5py.File(tmp_path / "c.h5", "w") as file:
         file.attrs["format"] = np.bytes_("lfpiv-calibration")
         file["lattice/origin_px"] = np.zeros(2)

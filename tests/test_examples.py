@@ -22,15 +22,14 @@ import tifffile
 
 from lfpiv_cli.cli.main import cli
 from lfpiv_cli.files.images import read_image
+from tests.commands import ROOT, SAMPLE, sample_weights
 
-ROOT = Path(__file__).parent.parent
 EXAMPLES = ROOT / "examples"
-SMALL = {
-    "shape_xyz: [30, 22, 40]": "shape_xyz: [8, 6, 12]",
-    "reference: mid_plane": "reference: focal_point",
-    "windows: [24, 12]": "windows: [6]",
-    "iterations: 16": "iterations: 2",
-}
+SMALL = (
+    ("shape_xyz: [30, 22, 40]", "shape_xyz: [8, 6, 12]"),
+    ("windows: [24, 12]", "windows: [6]"),
+    ("iterations: 16", "iterations: 2"),
+)
 LFPIV = f"""#!/bin/sh
 exec {shlex.quote(sys.executable)} -m lfpiv_cli "$@"
 """
@@ -70,13 +69,8 @@ def experiment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("STANDINS", str(standins))
     work = tmp_path / "work"
     (work / "run").mkdir(parents=True)
-    text = (ROOT / "configs" / "sample.yaml").read_text()
-    for old, new in SMALL.items():
-        assert old in text
-        text = text.replace(old, new)
-    (work / "rig.yaml").write_text(text)
-    cli.main(["build-weights", str(work / "rig.yaml"), "-o", str(work / "weights.h5"), "-q"], standalone_mode=False)
-    image, rng = read_image(ROOT / "sample_data" / "pair_a.tif"), np.random.default_rng(1)
+    sample_weights(work, *SMALL)
+    image, rng = read_image(SAMPLE / "pair_a.tif"), np.random.default_rng(1)
     for name in ("1_a", "1_b", "2_a", "2_b"):
         tifffile.imwrite(work / "run" / f"{name}.tif", (image + rng.uniform(0.0, 9.0, image.shape)).astype(np.uint16))
     return work
@@ -124,15 +118,12 @@ def test_the_documents_name_every_example() -> None:
 
 
 @pytest.mark.slow
-def test_an_array_of_jobs(experiment: Path) -> None:
+def test_an_array_of_jobs_and_one_that_stops_early(experiment: Path) -> None:
     job = shlex.quote(str(EXAMPLES / "array.sbatch"))
     run(f"sbatch --array=1-3 {job} weights.h5 run volumes", experiment)
     assert results(experiment / "volumes") == VOLUMES
     assert not (experiment.parent / "standins" / "requeued").exists()
-
-
-@pytest.mark.slow
-def test_a_job_that_stops_early_is_queued_again(experiment: Path) -> None:
+    # A job that stops early is queued again.
     job = (EXAMPLES / "array.sbatch").read_text()
     assert "--time-limit 01:55:00" in job
     script(experiment, "short.sbatch", job.replace("--time-limit 01:55:00", "--time-limit 0.001s"))

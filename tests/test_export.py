@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from scipy.io import loadmat, netcdf_file
 
-from lfpiv_cli.cli.main import cli
 from lfpiv_cli.errors import InputError, OutputError, UsageError
 from lfpiv_cli.files.exports import formats
 from lfpiv_cli.files.exports.formats import FORMATS, Content, columns_of, read_content
@@ -29,6 +28,7 @@ from lfpiv_cli.flow.field import VectorField
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.names import ExportFormat
 from lfpiv_cli.reference import Reference
+from tests.commands import run
 from tests.read_back import same
 
 GRID = Grid((4, 3, 2), (0.1, 0.3, 0.7), (-0.15, 1 / 3, 2.0))
@@ -79,10 +79,6 @@ def write_kind(kind: str, folder: Path, rng: np.random.Generator) -> Path:
     return path
 
 
-def run(*arguments: object) -> None:
-    cli.main([*map(str, arguments), "--quiet"], standalone_mode=False)
-
-
 def exported(source: Path, to: ExportFormat) -> tuple[Path, Content]:
     """Return what `export` writes of a file, and what was in it."""
     run("export", source, "--to", to)
@@ -104,7 +100,7 @@ def test_tecplot_is_understood_by_the_reader_of_vtk(tmp_path: Path, rng: np.rand
     np.testing.assert_allclose(vtk_to_numpy(zone.GetPointData().GetArray("u")), columns["u"], rtol=1e-6)
 
 
-def test_tecplot_has_a_zone_for_each_frame_with_its_time(tmp_path: Path, rng: np.random.Generator) -> None:
+def test_sequences_have_a_zone_or_a_step_for_each_frame_with_its_time(tmp_path: Path, rng: np.random.Generator) -> None:
     path, _ = exported(write_kind("trajectories", tmp_path, rng), "tecplot")
     zones = [line for line in path.read_text().splitlines() if line.startswith("ZONE")]
     assert zones == [
@@ -112,6 +108,12 @@ def test_tecplot_has_a_zone_for_each_frame_with_its_time(tmp_path: Path, rng: np
         'ZONE T="frame 2", STRANDID=1, SOLUTIONTIME=0.004, I=2, J=1, K=1, DATAPACKING=POINT',
         'ZONE T="frame 3", STRANDID=1, SOLUTIONTIME=0.006, I=2, J=1, K=1, DATAPACKING=POINT',
     ]
+    source = tmp_path / "trajectories.vtkhdf"
+    run("export", source, "--to", "vtkhdf-series", "-o", tmp_path / "playback.vtkhdf")
+    with h5py.File(tmp_path / "playback.vtkhdf") as file:
+        assert file.attrs["format"] == b"lfpiv-playback"
+        np.testing.assert_array_equal(file["VTKHDF/NumberOfPoints"], [1, 0, 2, 2])
+        np.testing.assert_allclose(file["VTKHDF/Steps/Values"], [0.0, 0.002, 0.004, 0.006])
 
 
 @pytest.mark.thorough
@@ -140,15 +142,6 @@ def test_vtk_plays_vectors(planes: int, tmp_path: Path, rng: np.random.Generator
     with h5py.File(tmp_path / "series.vtkhdf") as file:
         assert file.attrs["format"] == b"lfpiv-series"
         assert json.loads(file.attrs["provenance"])["inputs"]["file_0002"]["name"] == "2.vtkhdf"
-
-
-def test_tracks_of_a_sequence_are_played_as_follow_writes_them(tmp_path: Path, rng: np.random.Generator) -> None:
-    source = write_kind("trajectories", tmp_path, rng)
-    run("export", source, "--to", "vtkhdf-series", "-o", tmp_path / "playback.vtkhdf")
-    with h5py.File(tmp_path / "playback.vtkhdf") as file:
-        assert file.attrs["format"] == b"lfpiv-playback"
-        np.testing.assert_array_equal(file["VTKHDF/NumberOfPoints"], [1, 0, 2, 2])
-        np.testing.assert_allclose(file["VTKHDF/Steps/Values"], [0.0, 0.002, 0.004, 0.006])
 
 
 @pytest.mark.thorough
@@ -209,8 +202,7 @@ def test_no_points_are_no_fault(name: str, tmp_path: Path, rng: np.random.Genera
         assert file.variables["position_mm"].shape == (0, 3)
     assert (tmp_path / "none.csv").read_text().splitlines()[-1].startswith("x,y,z,")
     assert loadmat(tmp_path / "none.mat")["position_mm"].shape == (0, 3)
-    vtk = pytest.importorskip("vtkmodules.vtkIOXML")
-    reader = vtk.vtkXMLPolyDataReader()
+    reader = pytest.importorskip("vtkmodules.vtkIOXML").vtkXMLPolyDataReader()
     reader.SetFileName(str(tmp_path / "none.vtp"))
     reader.Update()
     assert (reader.GetErrorCode(), reader.GetOutput().GetNumberOfPoints()) == (0, 0)
@@ -233,7 +225,9 @@ def test_several_files_need_a_name_and_a_format_for_them(tmp_path: Path, rng: np
     [({"grid": Grid((4, 3, 3), GRID.spacing_mm, GRID.origin_mm)}, "on Grid"), ({"dt_s": 0.003}, "'dt_s': 0.003")],
 )
 @pytest.mark.parametrize("to", ["netcdf", "vtkhdf-series"])
-def test_times_that_do_not_belong_together_are_refused(to, changes, words, tmp_path, rng) -> None:
+def test_times_that_do_not_belong_together_are_refused(
+    to: ExportFormat, changes: list[tuple[str, str]], words: str, tmp_path: Path, rng: np.random.Generator
+) -> None:
     write_field(tmp_path / "a.vtkhdf", rng)
     write_field(tmp_path / "b.vtkhdf", rng, **changes)
     with pytest.raises(InputError, match=words):
@@ -241,7 +235,7 @@ def test_times_that_do_not_belong_together_are_refused(to, changes, words, tmp_p
     assert not (tmp_path / "all").exists()
 
 
-def test_planes_are_counted_from_0_and_points_have_none(tmp_path: Path, rng: np.random.Generator) -> None:
+def test_files_and_planes_that_there_are_not_are_told(tmp_path: Path, rng: np.random.Generator) -> None:
     with pytest.raises(UsageError, match="--plane 2: .* has 2 planes"):
         run("export", write_kind("vectors", tmp_path, rng), "--to", "vti", "--plane", 2)
     with pytest.raises(UsageError, match="no planes"):
@@ -249,7 +243,9 @@ def test_planes_are_counted_from_0_and_points_have_none(tmp_path: Path, rng: np.
 
 
 @pytest.mark.parametrize(("limit", "to"), [("LARGEST_BYTES", "mat"), ("LARGEST_VARIABLE", "netcdf")])
-def test_arrays_that_are_too_large_are_refused(limit, to, tmp_path, rng, monkeypatch) -> None:
+def test_arrays_that_are_too_large_are_refused(
+    limit, to: ExportFormat, tmp_path: Path, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
     source = write_kind("volume", tmp_path, rng)
     monkeypatch.setattr(formats, limit, 40)
     with pytest.raises(OutputError, match="intensity has 96 bytes"):

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -22,6 +20,7 @@ from lfpiv_cli.synthetic.flows import taylor_green
 from lfpiv_cli.tracks.candidates import Seen
 from lfpiv_cli.tracks.in_time import HighDerivatives, high_derivatives_in, high_derivatives_of, motion_of, motions_at
 from lfpiv_cli.verbs.field import link_probability, pressure_of, pressure_of_steady_flow, trajectories_from
+from tests.commands import ROOT
 
 TIME = np.arange(-3.0, 4.0)
 STILL = HighDerivatives(np.ones(3), np.zeros((2, 3)))
@@ -39,12 +38,17 @@ def places(rng, count, derivatives, sigma):
     return powers @ derivatives + noise, covariance
 
 
-def test_a_quartic_is_exact_where_derivatives_may_be_large(rng):
+def test_a_quartic_is_exact_and_a_parabola_has_the_textbook_error(rng):
+    # Derivatives that may be large.
     derivatives = rng.normal(size=(5, 3))
     position, covariance = places(rng, 2, derivatives, (1e-9, 1e-9, 1e-8))
     found = motion_of(position, covariance, TIME, ANY)
     for name, row in (("position_mm", 0), ("velocity", 1), ("acceleration", 2)):
         np.testing.assert_allclose(getattr(found, name), np.tile(derivatives[row], (2, 1)), atol=1e-6)
+    # The sum of the squared orthogonal parabola over seven places is 84: var(2 c) = 4 / 84.
+    covariance = np.broadcast_to(np.eye(3), (1, 7, 3, 3))
+    found = motion_of(np.zeros((1, 7, 3)), covariance, TIME, STILL)
+    np.testing.assert_allclose(found.covariance[0], 4.0 / 84.0 * np.eye(3), rtol=1e-6, atol=1e-9)
 
 
 @pytest.mark.parametrize("high", [STILL, ANY])
@@ -58,30 +62,21 @@ def test_accelerations_err_as_they_state(rng, high):
     np.testing.assert_allclose(np.cov(white.T), np.eye(3), atol=0.08)
 
 
-def test_a_parabola_over_seven_places_has_the_textbook_error():
-    """The sum of the squared orthogonal parabola over seven places is 84: var(2 c) = 4 / 84."""
-    covariance = np.broadcast_to(np.eye(3), (1, 7, 3, 3))
-    found = motion_of(np.zeros((1, 7, 3)), covariance, TIME, STILL)
-    np.testing.assert_allclose(found.covariance[0], 4.0 / 84.0 * np.eye(3), rtol=1e-6, atol=1e-9)
-
-
-def test_noise_and_fourth_derivatives_are_told_by_all_tracks(rng):
+def test_noise_and_fourth_derivatives_are_told_by_all_tracks_but_not_by_few(rng):
     position, covariance = places(rng, 3000, np.zeros((5, 3)), (2e-3, 2e-3, 2e-3))
     fourth = rng.normal(0.0, (0.02, 0.0, 0.0), (3000, 1, 3))
     high = high_derivatives_of(position + fourth * TIME[:, np.newaxis] ** 4 / 24.0, 0.25 * covariance, TIME)
     np.testing.assert_allclose(high.noise, 2.0, rtol=0.08)
     assert np.sqrt(high.variance[1, 0]) == pytest.approx(0.02, rel=0.1)
     assert np.all(np.sqrt(high.variance[1, 1:]) < 0.001)
-
-
-def test_too_few_tracks_or_frames_tell_nothing(rng):
+    # Too few tracks or frames tell nothing.
     position, covariance = places(rng, 29, np.zeros((5, 3)), (1e-3, 1e-3, 1e-3))
     assert high_derivatives_of(position, covariance, TIME) is None
     position, covariance = places(rng, 60, np.zeros((5, 3)), (1e-3, 1e-3, 1e-3))
     assert high_derivatives_of(position[:, :4], covariance[:, :4], TIME[:4]) is None
 
 
-def test_a_track_with_gaps_is_taken_and_one_of_two_places_is_not(rng):
+def test_tracks_with_gaps_are_taken_and_places_without_errors_or_tracks_of_two_are_not(rng):
     flow = taylor_green(0.1, 10.0)
     sequence = sequence_of(flow, 40, rng, 0.2)
     labels = [each.copy() for each in sequence.found.labels]
@@ -90,38 +85,30 @@ def test_a_track_with_gaps_is_taken_and_one_of_two_places_is_not(rng):
     for frame in (0, 1, 2, 4, 5):
         labels[frame][1] = -1
     found = type(sequence.found)(tuple(labels), 40, sequence.found.probability)
-    tracks, motion = motions_at(found, sequence.seen, 3, high_derivatives_in(sequence.found, sequence.seen))
+    high = high_derivatives_in(sequence.found, sequence.seen)
+    (tracks, motion), (_, every) = (motions_at(each, sequence.seen, 3, high) for each in (found, sequence.found))
     assert set(range(40)) - set(tracks.tolist()) == {1}
     assert np.isfinite(motion.acceleration).all()
-    assert motion.covariance[0, 2, 2] > motion_of_all(sequence).covariance[0, 2, 2]
-
-
-def motion_of_all(sequence):
-    return motions_at(sequence.found, sequence.seen, 3, high_derivatives_in(sequence.found, sequence.seen))[1]
-
-
-def test_a_place_whose_errors_are_not_known_is_left_out(rng):
+    assert motion.covariance[0, 2, 2] > every.covariance[0, 2, 2]
+    # A place whose errors are not known is left out.
     sequence = sequence_of(taylor_green(0.1, 10.0), 40, rng, 0.2)
     sequence.seen[3].covariance_mm2[5] = np.nan
     _, motion = motions_at(sequence.found, sequence.seen, 3, high_derivatives_in(sequence.found, sequence.seen))
     assert np.isfinite(motion.acceleration).all()
 
 
-def test_six_elements_make_a_matrix(rng):
+def test_matrices_of_six_elements_gradients_and_knots(rng):
     half = rng.normal(size=(4, 3, 3))
     matrices = half + half.swapaxes(1, 2)
     six = matrices[:, [0, 1, 2, 0, 1, 0], [0, 1, 2, 1, 2, 2]]
     np.testing.assert_array_equal(Seen(np.zeros((4, 3)), six).covariances(), matrices)
-
-
-def gradient_samples(rng, count=60):
-    points = rng.uniform(0.0, (3.0, 2.0, 2.0), (count, 3))
-    root = rng.normal(size=(count, 3, 3))
-    return Samples(points, rng.normal(size=(count, 3)), root @ root.swapaxes(1, 2) + np.eye(3), np.ones(count), 0.0)
+    assert int(np.prod(Lattice.affordable((0, 0, 0), (13, 10, 10), 0.1).shape)) <= 3000
 
 
 def test_the_matrix_of_gradients_is_that_of_a_small_box(rng):
-    samples = gradient_samples(rng)
+    root = rng.normal(size=(60, 3, 3))
+    errors = root @ root.swapaxes(1, 2) + np.eye(3)
+    samples = Samples(rng.uniform(0.0, (3.0, 2.0, 2.0), (60, 3)), rng.normal(size=(60, 3)), errors, np.ones(60), 0.0)
     weight = np.linalg.inv(samples.covariance_mm2)
     matrix = stencils.empty(BOX, 1)
     pressure.add_gradients(matrix, BOX, samples.points_mm, weight)
@@ -144,9 +131,8 @@ def test_gradients_of_splines_are_their_differences(rng):
     found = pressure.gradient_at(points, BOX, coefficients)
     for axis in range(3):
         shift = step * np.eye(3)[axis]
-        np.testing.assert_allclose(
-            found[:, axis], (value(points + shift) - value(points - shift)) / (2 * step), atol=1e-6
-        )
+        slope = (value(points + shift) - value(points - shift)) / (2 * step)
+        np.testing.assert_allclose(found[:, axis], slope, atol=1e-6)
 
 
 def test_poisson_a_fit_has_the_pressure_whose_gradient_accelerates_the_fluid(rng):
@@ -191,24 +177,19 @@ def test_wrong_accelerations_are_left_out(rng):
     assert field.probability[20:].mean() > 0.97
 
 
-class Cubic:
-    """A displacement u = (x^3, y^2 z, 0)."""
-
-    def gradient_at(self, points):
-        x, y, z = points.T
-        found = np.zeros((len(points), 3, 3))
-        found[:, 0, 0], found[:, 1, 1], found[:, 1, 2] = 3.0 * x**2, 2.0 * y * z, y**2
-        return found
-
-
 def test_the_laplacian_is_the_divergence_of_gradients(rng):
+    class Cubic:
+        """A displacement u = (x^3, y^2 z, 0)."""
+
+        def gradient_at(self, points):
+            x, y, z = points.T
+            found = np.zeros((len(points), 3, 3))
+            found[:, 0, 0], found[:, 1, 1], found[:, 1, 2] = 3.0 * x**2, 2.0 * y * z, y**2
+            return found
+
     points = rng.normal(size=(10, 3))
     expected = np.stack([6.0 * points[:, 0], 2.0 * points[:, 2], np.zeros(10)], axis=1)
     np.testing.assert_allclose(laplacian_at(Cubic(), points), expected, atol=1e-9)
-
-
-def test_knots_are_bounded():
-    assert int(np.prod(Lattice.affordable((0, 0, 0), (13, 10, 10), 0.1).shape)) <= 3000
 
 
 def sequence_files(rng, step_mm=0.2, count=200):
@@ -216,14 +197,10 @@ def sequence_files(rng, step_mm=0.2, count=200):
     sequence = sequence_of(taylor_green(0.1, 10.0), count, rng, step_mm)
     nowhere = (FOCAL_POINT, {"dt_s": sequence.dt_s}, {})
     shuffled = [rng.permutation(count) for _ in sequence.seen]
-    frames = [
-        Points(
-            each.position_mm[order],
-            {"covariance_mm2": each.covariance_mm2[order], "intensity": np.ones(count)},
-            *nowhere,
-        )
-        for each, order in zip(sequence.seen, shuffled, strict=True)
-    ]
+    frames = []
+    for each, order in zip(sequence.seen, shuffled, strict=True):
+        arrays = {"covariance_mm2": each.covariance_mm2[order], "intensity": np.ones(count)}
+        frames.append(Points(each.position_mm[order], arrays, *nowhere))
     track, frame = np.repeat(np.arange(count), 7), np.tile(np.arange(7), count)
     inverse = np.stack([np.argsort(order) for order in shuffled])
     positions = np.stack([each.position_mm for each in sequence.seen], axis=1)
@@ -239,7 +216,7 @@ def sequence_files(rng, step_mm=0.2, count=200):
 
 
 def water(**options):
-    settings = load_config(Path("configs/table2.yaml"))
+    settings = load_config(ROOT / "configs" / "table2.yaml")
     return settings.overridden("media", **({"fluid_density_kg_m3": 998.2, "fluid_viscosity_pa_s": 1e-3} | options))
 
 
@@ -258,7 +235,7 @@ def test_rows_of_a_file_are_the_trajectories_again(rng):
 def test_density_and_viscosity_are_asked_for(rng):
     points, frames, _ = sequence_files(rng, count=30)
     with pytest.raises(ConfigError, match=r"media.fluid_density_kg_m3: is missing"):
-        pressure_of(points, frames, load_config(Path("configs/table2.yaml")))
+        pressure_of(points, frames, load_config(ROOT / "configs" / "table2.yaml"))
     with pytest.raises(UsageError, match="frame 7 is none of 7"):
         pressure_of(points, frames, water(), 7)
 

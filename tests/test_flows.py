@@ -62,10 +62,14 @@ def gradient(flow, points, step):
     return np.stack(columns, axis=2)
 
 
-def test_registry_holds_every_flow():
+def test_registry_holds_every_flow_and_pressure_where_it_has_a_closed_form():
     assert set(FLOWS) == set(EXAMPLES)
     for name, flow in EXAMPLES.items():
         assert flow(np.zeros((4, 3))).shape == (4, 3), name
+    moved = {"velocity_m_s": (0.0, 0.0, 0.1)}
+    assert taylor_green(0.05, 8.0, **moved).pressure is None
+    assert abc((0.1, 0.1, 0.1), 8.0, **moved).pressure is None
+    assert CELLULAR.pressure is None
 
 
 @pytest.mark.parametrize("name", SOLENOIDAL)
@@ -89,30 +93,21 @@ def test_gradients_are_those_of_the_velocities(name, rng):
 @pytest.mark.parametrize("name", WITH_PRESSURE)
 def test_pressure_accelerates_the_fluid_as_euler_demands(name, rng):
     flow, points, density, step = WITH_PRESSURE[name], CENTRE + rng.uniform(-4.0, 4.0, (30, 3)), 998.0, 1e-3
-    slopes = [
-        (flow.pressure(points + step * e, density) - flow.pressure(points - step * e, density)) for e in np.eye(3)
-    ]
+    there, back = ([flow.pressure(points + sign * step * e, density) for e in np.eye(3)] for sign in (1.0, -1.0))
     acceleration = np.einsum("nij,nj->ni", flow.gradient(points), flow(points))
     # central differences over 2 um, in Pa/m; accelerations reach 1 m/s^2
-    assert np.stack(slopes, axis=1) / (2e-3 * step) == pytest.approx(-density * acceleration, abs=1e-2)
+    assert np.subtract(there, back).T / (2e-3 * step) == pytest.approx(-density * acceleration, abs=1e-2)
     assert np.abs(acceleration).max() > 0.05
 
 
-def test_pressure_is_left_out_without_a_closed_form():
-    moved = {"velocity_m_s": (0.0, 0.0, 0.1)}
-    assert taylor_green(0.05, 8.0, **moved).pressure is None
-    assert abc((0.1, 0.1, 0.1), 8.0, **moved).pressure is None
-    assert CELLULAR.pressure is None
-
-
-def test_duct_mean_over_the_section_is_the_given_mean():
+def test_duct_has_the_given_mean_and_a_square_s_peak():
     u = EXAMPLES["square_duct"](section(200, WIDTH / 2))[:, 0]
     assert u.mean() == pytest.approx(MEAN, rel=5e-5)  # midpoint rule with 200 cells: 1/(2 n^2) and its factor
-
-
-def test_duct_peak_to_mean_is_that_of_a_square():
     peak = EXAMPLES["square_duct"](np.array([CENTRE]))[0, 0]
     assert peak / MEAN == pytest.approx(2.0963, abs=5e-5)  # tabulated to four decimals
+    # at the axis 2.0963 * 0.1082 m/s * 1.8 ms = 0.40827 mm, the pair's four voxels of 0.1 mm
+    moved = advect(EXAMPLES["square_duct"], [CENTRE], 1.8e-3) - CENTRE
+    assert moved[0] == pytest.approx([0.40827, 0, 0], abs=1e-5)
 
 
 def test_duct_solves_poisson_equation(rng):
@@ -124,17 +119,13 @@ def test_duct_solves_poisson_equation(rng):
     assert laplacian * WIDTH**2 / MEAN == pytest.approx(np.full(100, -28.454), rel=1e-3)
 
 
-def test_duct_vanishes_on_and_beyond_the_walls():
+def test_duct_is_symmetric_and_vanishes_on_and_beyond_the_walls():
     half = WIDTH / 2
-    edge = (
-        np.array([(0, half, 1.0), (0, -half, 0), (0, 2.0, half), (0, 1.0, -half), (0, 6.0, 0), (0, 0, -5.1)]) + CENTRE
-    )
-    assert np.all(np.abs(EXAMPLES["square_duct"](edge)) < 1e-15)
+    edge = np.array([(0, half, 1.0), (0, -half, 0), (0, 2.0, half), (0, 1.0, -half), (0, 6.0, 0), (0, 0, -5.1)])
+    assert np.all(np.abs(EXAMPLES["square_duct"](edge + CENTRE)) < 1e-15)
     just_inside = np.array([(0, 1.0, half - 1e-9), (0, half - 1e-9, 1.0)]) + CENTRE
     assert np.abs(EXAMPLES["square_duct"](just_inside)).max() < 1e-5 * MEAN
-
-
-def test_duct_is_symmetric():
+    # Duct is symmetric.
     flow = EXAMPLES["square_duct"]
     points = section(9, 4.9) - CENTRE
     u = flow(points + CENTRE)[:, 0]
@@ -142,14 +133,22 @@ def test_duct_is_symmetric():
         assert flow(turned + CENTRE)[:, 0] == pytest.approx(u, abs=1e-5 * MEAN)
 
 
-def test_duct_along_y_is_the_duct_along_x_with_axes_exchanged(rng):
+def test_ducts_and_pipes_along_y_are_those_along_x_with_axes_exchanged_or_turned(rng):
     points = rng.uniform(-4.0, 4.0, (20, 3))
     along_x = square_duct(WIDTH, MEAN)(points)
     along_y = square_duct(WIDTH, MEAN, axis="y")(points[:, [1, 0, 2]])
     assert np.array_equal(along_y[:, [1, 0, 2]], along_x)
+    points = rng.uniform(-5.0, 5.0, (20, 3))
+    along_y = pipe(WIDTH / 2, MEAN, axis="y")(points[:, [1, 0, 2]])
+    assert np.array_equal(along_y[:, [1, 0, 2]], pipe(WIDTH / 2, MEAN)(points))
+    turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    points = rng.uniform(-3.0, 3.0, (20, 3))
+    straight, tilted = pipe(WIDTH / 2, MEAN), pipe(WIDTH / 2, MEAN, axis=tuple(3.0 * turn[:, 0]))
+    assert tilted(points @ turn.T) == pytest.approx(straight(points) @ turn.T, abs=1e-12)
+    assert tilted.gradient(points @ turn.T) == pytest.approx(turn @ straight.gradient(points) @ turn.T, abs=1e-9)
 
 
-def test_pipe_mean_over_the_section_is_the_given_mean():
+def test_pipe_has_the_given_mean_solves_poisson_equation_and_vanishes_outside(rng):
     line = (np.arange(400) + 0.5) / 400 * WIDTH - WIDTH / 2
     x, z = np.meshgrid(line, line)
     points = np.stack([x.ravel(), np.zeros(x.size), z.ravel()], axis=1) + CENTRE
@@ -157,9 +156,6 @@ def test_pipe_mean_over_the_section_is_the_given_mean():
     # a circle of 400 cells across: those that it cuts are slow
     assert u.sum() / x.size == pytest.approx(MEAN * np.pi / 4, rel=1e-5)
     assert u.max() == pytest.approx(2.0 * MEAN, rel=1e-4)
-
-
-def test_pipe_solves_poisson_equation_and_vanishes_outside(rng):
     flow, step = EXAMPLES["pipe"], 0.02
     points = CENTRE + rng.uniform(-3.4, 3.4, (100, 3))
     around = [step * np.array(e) for e in [(1, 0, 0), (-1, 0, 0), (0, 0, 1), (0, 0, -1)]]
@@ -171,36 +167,16 @@ def test_pipe_solves_poisson_equation_and_vanishes_outside(rng):
     assert not flow.gradient(beyond[1:]).any()
 
 
-def test_pipe_along_y_is_the_pipe_along_x_with_axes_exchanged(rng):
-    points = rng.uniform(-5.0, 5.0, (20, 3))
-    along_y = pipe(WIDTH / 2, MEAN, axis="y")(points[:, [1, 0, 2]])
-    assert np.array_equal(along_y[:, [1, 0, 2]], pipe(WIDTH / 2, MEAN)(points))
-
-
-def test_a_tilted_pipes_flow_is_one_along_x_turned(rng):
-    turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
-    points = rng.uniform(-3.0, 3.0, (20, 3))
-    straight, tilted = pipe(WIDTH / 2, MEAN), pipe(WIDTH / 2, MEAN, axis=tuple(3.0 * turn[:, 0]))
-    assert tilted(points @ turn.T) == pytest.approx(straight(points) @ turn.T, abs=1e-12)
-    assert tilted.gradient(points @ turn.T) == pytest.approx(turn @ straight.gradient(points) @ turn.T, abs=1e-9)
-
-
-def test_rotation_has_the_given_rate_sense_and_centre():
+def test_rotation_shear_and_taylor_green_vortices_by_hand():
     # omega = 3 rad/s about z: the point 1 mm along +x of the centre moves along +y with 3 mm/s
     flow = rigid_rotation((0.0, 0.0, 3.0), CENTRE, (0.1, 0.0, 0.0))
     assert flow(np.array([CENTRE, CENTRE + np.eye(3)[0]])) == pytest.approx(np.array([[0.1, 0, 0], [0.1, 3e-3, 0]]))
-
-
-def test_taylor_green_and_shear_by_hand():
     # a quarter wavelength along x: v_x = A sin(pi/2) = A; an eighth along both: A/2 and -A/2
     flow = taylor_green(0.05, 8.0, CENTRE, velocity_m_s=(0.0, 0.01, 0.0))
     points = np.array([(2.0, 5.0, 0.0), (1.0, 0.0, 1.0)]) + CENTRE
     assert flow(points) == pytest.approx(np.array([[0.05, 0.01, 0], [0.025, 0.01, -0.025]]), abs=1e-15)
     # 4 per second over 2 mm: 8 mm/s along z
     assert shear(4.0, "z", "x", CENTRE)(np.array([(2.0, 1.0, 1.0)]) + CENTRE) == pytest.approx(np.array([[0, 0, 8e-3]]))
-
-
-def test_taylor_green_in_three_dimensions_by_hand():
     # an eighth along all axes: each amplitude / 2^(3/2), that of z, the second axis, less the sum of the others
     expected = np.array([0.03, 0.05, -0.08]) / np.sqrt(8.0)
     assert CELLULAR(np.array([(1.0, 1.0, 1.0)]) + CENTRE)[0] == pytest.approx(expected, abs=1e-15)
@@ -243,15 +219,12 @@ def test_source_has_its_divergence_and_sinks_take_the_fluid_up():
     assert moved == pytest.approx([1e-3 * 80.0 / 3.0 * np.exp(-0.5), 0.01, 0.0])
 
 
-def test_advection_follows_a_circle(rng):
+def test_advection_follows_a_circle_and_returns(rng):
     points = CENTRE + rng.uniform(-5, 5, (20, 3))
     omega, duration = np.array([40.0, -30.0, 20.0]), 5e-3
     turned = Rotation.from_rotvec(omega * duration).apply(points - CENTRE) + CENTRE
     # 0.27 rad in four steps of (0.27/4)^5/120 each, 8 mm from the centre at most: 4e-7 mm
     assert advect(rigid_rotation(omega, CENTRE), points, duration) == pytest.approx(turned, abs=4e-7)
-
-
-def test_advection_forth_and_back_returns(rng):
     points = CENTRE + rng.uniform(-4, 4, (20, 3))
     for flow in EXAMPLES.values():
         assert advect(flow, advect(flow, points, 2e-3), -2e-3) == pytest.approx(points, abs=1e-9)
@@ -268,19 +241,10 @@ def test_pulsation_carries_tracers_as_its_equation_of_motion_does():
         # four Runge-Kutta steps over 1 mm in vortices of 8 mm: 1e-5 mm
         assert advect(flow, [start], pulsation.carried_s(time_s))[0] == pytest.approx(expected, abs=2e-5)
     assert STEADY.carried_s(-0.0123) == -0.0123
-
-
-def test_pulsation_accelerates_the_flow_in_the_middle():
     # 50 % at 20 Hz: 2 pi 20 0.5 = 62.83 per second of the velocity; over 0.1 ms the cubic term is 1e-5 of it
     pulsation, step = Pulsation(0.5, 20.0), 1e-4
     change = (pulsation.carried_s(step) + pulsation.carried_s(-step) - 2.0 * pulsation.carried_s(0.0)) / step**2
     assert change == pytest.approx(62.832, rel=1e-4)
-
-
-def test_duct_advection_moves_by_velocity_times_time():
-    # at the axis 2.0963 * 0.1082 m/s * 1.8 ms = 0.40827 mm, the pair's four voxels of 0.1 mm
-    moved = advect(EXAMPLES["square_duct"], [CENTRE], 1.8e-3) - CENTRE
-    assert moved[0] == pytest.approx([0.40827, 0, 0], abs=1e-5)
 
 
 @pytest.mark.thorough

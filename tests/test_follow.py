@@ -10,10 +10,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 import lfpiv_cli as lf
-from lfpiv_cli.cli.main import cli
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.errors import InputError, OutputExistsError, PartialError, StoppedEarlyError, UsageError
 from lfpiv_cli.files.batch import Frame
 from lfpiv_cli.files.images import write_tiff
@@ -22,24 +21,15 @@ from lfpiv_cli.files.shares import Deadline
 from lfpiv_cli.particles.fitting import add_all
 from lfpiv_cli.particles.view import raw_view
 from lfpiv_cli.verbs import follow as stage
+from tests.commands import run, sample_weights
 
-ROOT = Path(__file__).parent.parent
 FRAMES, COUNT = 4, 12
 # 0.8, -0.4 and 0.5 voxels a frame.
 MOVED_MM = np.array([0.08, -0.04, 0.05])
 DT_S, DARK_COUNTS = 0.002, 100.0
-CHANGES = (
-    ("columns: 600, rows: 448", "columns: 290, rows: 270"),
-    ("shape_xyz: [30, 22, 40]", "shape_xyz: [9, 8, 10]"),
-    ("centre_mm: [0, 0, 0], reference: mid_plane", "centre_mm: [0, 0, 1.9], reference: focal_point"),
-)
 
 
-def run(*arguments: object) -> None:
-    cli.main([str(argument) for argument in arguments], standalone_mode=False)
-
-
-def true_places() -> NDArray[np.float64]:
+def true_places() -> Floats:
     """Return the particles' places (frames, n, 3) from the focal point, mm: all are in the volume in each frame."""
     low, high = np.array([-0.4, -0.2, 1.5]), np.array([0.1, 0.35, 2.2])
     start = np.random.default_rng(1).uniform(low, high, (COUNT, 3))
@@ -50,12 +40,8 @@ def true_places() -> NDArray[np.float64]:
 def rig(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a folder with weights of the sample's rig, a smaller one, and images of particles."""
     folder = tmp_path_factory.mktemp("rig")
-    text = (ROOT / "configs" / "sample.yaml").read_text()
-    for old, new in CHANGES:
-        assert old in text, old
-        text = text.replace(old, new)
-    (folder / "rig.yaml").write_text(text)
-    run("build-weights", folder / "rig.yaml", "-o", folder / "weights.h5", "-q")
+    small = ("columns: 600, rows: 448", "columns: 290, rows: 270"), ("shape_xyz: [30, 22, 40]", "shape_xyz: [9, 8, 10]")
+    sample_weights(folder, *small, ("centre_mm: [0, 0, 0]", "centre_mm: [0, 0, 1.9]"))
     content, settings = lf.open_weights(folder / "weights.h5"), lf.load_rig(folder / "rig.yaml")
     view = raw_view(content.camera, settings.media_model(), 0.025)
     rng = np.random.default_rng(2)
@@ -114,13 +100,10 @@ def assert_right(tracks: Points) -> None:
 
 
 @pytest.mark.thorough
-def test_tracks_are_right(followed: Path) -> None:
+def test_tracks_are_right_and_those_that_track_links(followed: Path, tmp_path: Path) -> None:
     assert [path.is_file() for path in particle_files(followed)] == [True] * FRAMES
     assert_right(tracks_of(followed))
-
-
-@pytest.mark.thorough
-def test_track_links_the_same(followed: Path, tmp_path: Path) -> None:
+    # Track links the same.
     run("track", *particle_files(followed), "--shortest", 4, "-o", tmp_path / "tracks.vtkhdf")
     again, tracks = read_points(tmp_path / "tracks.vtkhdf", TRAJECTORIES_FORMAT), tracks_of(followed)
     np.testing.assert_array_equal(again.position_mm, tracks.position_mm)
@@ -129,9 +112,7 @@ def test_track_links_the_same(followed: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.thorough
-def test_in_memory_it_is_the_same(
-    rig: Path, followed: Path, one_thread: Callable[[], AbstractContextManager[None]]
-) -> None:
+def test_the_same_in_memory(rig: Path, followed: Path, one_thread: Callable[[], AbstractContextManager[None]]) -> None:
     pictures = [lf.read_image(path) for path in images(rig)]
     with one_thread():
         found = lf.follow(lf.open_weights(rig / "weights.h5"), pictures, dark=lf.read_image(rig / "dark.tif"))
@@ -144,9 +125,7 @@ def test_in_memory_it_is_the_same(
 
 
 @pytest.mark.thorough
-def test_what_was_interrupted_goes_on(
-    rig: Path, followed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_was_stopped_goes_on(rig: Path, followed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As if it had not been, on other threads; so does what has lost a file."""
     make = stage.Way.make
 
@@ -184,12 +163,14 @@ def test_what_is_there_is_replaced_when_asked(rig: Path, followed: Path) -> None
     assert bytes_of(followed) == before
 
 
-def test_two_frames_are_refused(rig: Path, tmp_path: Path) -> None:
+def test_two_frames_or_a_share_are_refused(rig: Path, tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=r"3 frames at least, got 2; for a pair: .*track"):
         follow(rig, tmp_path / "run", frames=images(rig)[:2])
     assert not (tmp_path / "run").exists()
     with pytest.raises(UsageError, match="3 frames"):
         lf.follow(lf.open_weights(rig / "weights.h5"), [lf.read_image(path) for path in images(rig)[:2]])
+    with pytest.raises(UsageError, match="cannot be divided"):
+        run("follow", tmp_path / "weights.h5", tmp_path / "a.tif", "--shard", "1/2", "-o", tmp_path / "run")
 
 
 @pytest.mark.thorough
@@ -220,7 +201,7 @@ def test_both_ways_keep_what_was_found_forwards(rig: Path, followed: Path, tmp_p
 
 
 @pytest.mark.thorough
-def test_tracks_end_before_a_frame_that_cannot_be_read(rig: Path, tmp_path: Path, capsys) -> None:
+def test_tracks_end_before_a_frame_that_is_lost(rig: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     names = [tmp_path / f"t_{number}.tif" for number in (8, 9, 10, 11, 13)]
     for path, source in zip(names, [0, 1, 2, None, 3], strict=True):
         path.write_bytes(b"II" if source is None else images(rig)[source].read_bytes())
@@ -258,15 +239,15 @@ def test_a_sequence_begins_with_two_frames_that_can_be_read(tmp_path: Path) -> N
     assert "one value everywhere" in left_out[2].error
 
 
-def test_a_sequence_is_not_divided(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="cannot be divided"):
-        run("follow", tmp_path / "weights.h5", tmp_path / "a.tif", "--shard", "1/2", "-o", tmp_path / "run")
-
-
 @pytest.mark.thorough
 @pytest.mark.parametrize("ways", [(), ("--both-ways",)])
 def test_it_stops_before_its_time_limit_and_goes_on(
-    rig: Path, followed: Path, tmp_path: Path, ways: tuple[str, ...], monkeypatch: pytest.MonkeyPatch, capsys
+    rig: Path,
+    followed: Path,
+    tmp_path: Path,
+    ways: tuple[str, ...],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     output, asked = tmp_path / "run", 0
 

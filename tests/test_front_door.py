@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-import pytest
 import yaml
 
 import lfpiv_cli
@@ -24,8 +23,8 @@ from lfpiv_cli.reconstruction.registry import SOLVERS, Solver
 from lfpiv_cli.reconstruction.solvers import SolverSettings, reconstruct
 from lfpiv_cli.reference import Reference
 from lfpiv_cli.synthetic.flows import FLOWS
+from tests.commands import ROOT
 
-ROOT = Path(__file__).parent.parent
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 GUIDE = (ROOT / "CONTRIBUTING.md").read_text()
 WORKFLOW = yaml.safe_load((ROOT / ".github" / "workflows" / "ci.yml").read_text())
@@ -47,7 +46,7 @@ def names_in(module: Path) -> set[str]:
     return names
 
 
-def test_version_stands_in_one_place():
+def test_version_stands_in_one_place() -> None:
     assert "version" not in PROJECT["project"]
     assert PROJECT["tool"]["setuptools"]["dynamic"]["version"] == {"attr": "lfpiv_cli.__version__"}
     # a literal: setuptools then reads it without importing the package, whose dependencies a build does not have
@@ -57,12 +56,9 @@ def test_version_stands_in_one_place():
     assert "version" not in yaml.safe_load((ROOT / "CITATION.cff").read_text())
 
 
-def test_changelog_says_what_is_not_released():
+def test_citation_names_program_and_method_and_the_changelog_what_is_not_released() -> None:
     headings = re.findall(r"^## \[(.+?)\]", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
     assert headings[0] == "Unreleased"
-
-
-def test_citation_names_program_and_method():
     citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
     assert {"cff-version", "message", "title", "authors"} <= citation.keys()
     assert citation["license"] == PROJECT["project"]["license"]
@@ -71,31 +67,30 @@ def test_citation_names_program_and_method():
     assert paper["authors"][0]["family-names"] == "Zhu"
 
 
-@pytest.mark.parametrize(("path", "name"), PLACES)
-def test_guide_names_what_exists(path, name):
-    place = ROOT / path
-    assert place.exists()
-    if name is not None:
-        assert name in names_in(place)
+def test_guide_names_what_exists() -> None:
+    for path, name in PLACES:
+        assert (ROOT / path).exists(), path
+        assert name is None or name in names_in(ROOT / path), (path, name)
 
 
-def test_guide_lists_files_and_tests_for_each_addition():
+def test_guide_lists_files_and_tests_for_each_addition() -> None:
     sections = GUIDE.split("## How to add", 1)[1].split("\n### ")[1:]
     assert len(sections) >= 4
+    most = (
+        "A solver",
+        "A kind of surface",
+        "A window weighting",
+        "A format of a camera's frames",
+        "A figure in a report",
+    )
+    touched = {}
     for section in sections:
-        paths = [match.group(1) for match in PLACE.finditer(section)]
-        assert any(path.startswith("lfpiv_cli/") for path in paths)
-        assert any(path.startswith("tests/") for path in paths), section.splitlines()[0]
-
-
-@pytest.mark.parametrize(
-    "title",
-    ["A solver", "A kind of surface", "A window weighting", "A format of a camera's frames", "A figure in a report"],
-)
-def test_what_is_added_most_touches_four_files(title: str) -> None:
-    section = GUIDE.split(f"\n### {title}\n", 1)[1].split("\n### ", 1)[0]
-    touched = {match.group(1) for match in PLACE.finditer(section) if match.group(1).startswith("lfpiv_cli/")}
-    assert 1 <= len(touched) <= 4, touched
+        title, paths = section.splitlines()[0], {match.group(1) for match in PLACE.finditer(section)}
+        touched[title] = {path for path in paths if path.startswith("lfpiv_cli/")}
+        assert touched[title], title
+        assert any(path.startswith("tests/") for path in paths), title
+    # What is added most touches four files.
+    assert all(1 <= len(touched[title]) <= 4 for title in most), touched
 
 
 class Pixels:
@@ -114,7 +109,7 @@ def halve(problem, volume, projection, relaxation):
     return volume / 2
 
 
-def test_a_solver_is_added_by_its_step_and_its_name(monkeypatch):
+def test_a_solver_is_added_by_its_step_and_its_name(monkeypatch) -> None:
     monkeypatch.setitem(SOLVERS, "halve", Solver(f"{__name__}:{halve.__name__}"))
     result = reconstruct(Pixels(), np.array([[4.0, 2.0]], np.float32), SolverSettings("halve", 3))
     start = reconstruct(Pixels(), np.array([[4.0, 2.0]], np.float32), SolverSettings("halve", 0))
@@ -122,7 +117,7 @@ def test_a_solver_is_added_by_its_step_and_its_name(monkeypatch):
     assert result.residual.shape == (4,)
 
 
-def test_a_weighting_is_added_by_its_function_and_its_name(monkeypatch):
+def test_a_weighting_is_added_by_its_function_and_its_name(monkeypatch) -> None:
     def triangle(offset):
         return 1.0 - 2.0 * np.abs(offset)
 
@@ -137,7 +132,7 @@ def test_a_weighting_is_added_by_its_function_and_its_name(monkeypatch):
     assert not np.array_equal(found["uniform"], found["triangle"])
 
 
-def test_a_camera_format_is_added_by_its_reader_and_its_line(monkeypatch, tmp_path):
+def test_a_camera_format_is_added_by_its_reader_and_its_line(monkeypatch, tmp_path) -> None:
     image = np.arange(12, dtype=np.float32).reshape(3, 4)
 
     def frames(path):
@@ -154,7 +149,7 @@ class Expansion(Section):
     centre_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
-def test_a_flow_is_added_by_its_factory_and_its_section(monkeypatch):
+def test_a_flow_is_added_by_its_factory_and_its_section(monkeypatch) -> None:
     def expansion(rate_per_s, centre_mm):
         return lambda points_mm: 1e-3 * rate_per_s * (points_mm - np.asarray(centre_mm))
 
@@ -163,7 +158,7 @@ def test_a_flow_is_added_by_its_factory_and_its_section(monkeypatch):
     np.testing.assert_allclose(flow(np.array([[1.0, 0.0, -0.5]])), [[0.002, 0.0, 0.0]])
 
 
-def test_workflow_runs_make_on_what_is_promised():
+def test_workflow_runs_make_on_what_is_promised_and_hooks_its_checks() -> None:
     job = WORKFLOW["jobs"]["make"]
     pythons = {line.rsplit(" ", 1)[1] for line in PROJECT["project"]["classifiers"] if re.search(r":: 3\.\d+$", line)}
     assert set(job["strategy"]["matrix"]["python"]) == pythons
@@ -174,8 +169,5 @@ def test_workflow_runs_make_on_what_is_promised():
     phony = re.search(r"^\.PHONY: (.+)$", (ROOT / "Makefile").read_text(), re.MULTILINE)
     assert phony is not None
     assert targets <= set(phony.group(1).split())
-
-
-def test_hooks_are_those_of_make_check():
     hooks = yaml.safe_load((ROOT / ".pre-commit-config.yaml").read_text())["repos"][0]["hooks"]
     assert {hook["id"] for hook in hooks} == {"ruff-check", "ruff-format", "mypy"}

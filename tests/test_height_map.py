@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.names import ColumnAxis
 from lfpiv_cli.optics.camera import Camera
@@ -17,13 +17,13 @@ from lfpiv_cli.optics.media import Media
 from lfpiv_cli.optics.shapes import HeightMap, Vector, height_at, reliefs_of
 from lfpiv_cli.optics.surfaces import Cylinder, Plane, Sphere, Surface, TiltedPlane, meet, normal_change
 from lfpiv_cli.optics.tracing import disc_points
-from tests.known_rays import rays_from_air, rays_to_air
+from tests.known_rays import assert_rays_go_back
 
 INNER = Face(Cylinder((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), 5.0), 1.33)
 OUTER = Cylinder((0.0, 0.3, 0.0), (1.0, 0.0, 0.0), 7.0)
 DOME = Sphere((0.4, -0.3, 1.0), 8.0)
 
-Heights = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]]
+Heights = Callable[[Floats, Floats], Floats]
 
 
 def sampled(
@@ -39,15 +39,15 @@ def sampled(
     return HeightMap(tuple(map(tuple, rows.tolist())), spacing, centre)
 
 
-def of_cylinder(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
+def of_cylinder(x: Floats, y: Floats) -> Floats:
     return 0.0 * x - np.sqrt(49.0 - (y - 0.3) ** 2)
 
 
-def of_sphere(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
+def of_sphere(x: Floats, y: Floats) -> Floats:
     return 1.0 - np.sqrt(64.0 - (x - 0.4) ** 2 - (y + 0.3) ** 2)
 
 
-def of_third_degree(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
+def of_third_degree(x: Floats, y: Floats) -> Floats:
     """Heights that the spline has exactly."""
     return -6.0 + 0.1 * x - 0.05 * y + 0.03 * x * y + 0.04 * y**2 + 1e-3 * x**3 * y - 2e-4 * x**2 * y**3
 
@@ -57,7 +57,7 @@ def behind(surface: Surface) -> CurvedSpace:
     return CurvedSpace(Media(1.0, 1.49, 1.33), (Face(surface, 1.49), INNER))
 
 
-def points_and_crossings(rng: np.random.Generator, count: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def points_and_crossings(rng: np.random.Generator, count: int) -> tuple[Floats, Floats]:
     points = np.concatenate([rng.uniform(-3, 3, (count, 1)), disc_points(count, 2.5, rng)], axis=1)
     return points, disc_points(count, 12.5, rng)
 
@@ -75,10 +75,7 @@ def test_heights_of_third_degree_and_their_derivatives_are_exact(rng: np.random.
         )
         # roundings of 6 mm, over the square of a step of 0.3 mm, through a spline of thirty nodes
         np.testing.assert_allclose(height_at(reliefs, 1, x, y), [*expected, 1.0], atol=1e-12)
-
-
-def test_curvature_goes_on_from_cell_to_cell() -> None:
-    """As Newton's iteration for rays needs it."""
+    # Curvature goes on from cell to cell.
     reliefs = reliefs_of([sampled(of_sphere).relief])
     for node in ((0.4, 0.1), (0.1, 0.3), (-1.2, 0.6)):
         before, after = (height_at(reliefs, 0, *(np.array(node) + side)) for side in (-1e-9, 1e-9))
@@ -124,22 +121,7 @@ def test_a_plane_by_its_heights_is_that_plane(table2: Camera, rng: np.random.Gen
 
 
 def test_rays_through_heights_go_back_the_way_they_came(table2: Camera, rng: np.random.Generator) -> None:
-    space = behind(sampled(of_third_degree))
-    points, crossing = points_and_crossings(rng, 200)
-    slopes, seen = space.slopes(table2, points, crossing)
-    assert seen.all()
-    places, valid = rays_from_air(space, table2, crossing, slopes, points[:, 2])
-    assert valid.all()
-    np.testing.assert_allclose(places, points[:, :2], atol=1e-12)
-    short, _ = rays_from_air(space, table2, crossing, slopes, points[:, 2] - 1e-3)
-    towards = np.concatenate([short - places, np.full((200, 1), -1e-3)], axis=1)
-    back, slopes_back, valid = rays_to_air(space, table2, points, towards)
-    # the direction by a difference of 1e-3 mm, of which 1e-15 are lost: 1e-12, over 200 mm
-    assert valid.all()
-    np.testing.assert_allclose(back, crossing, atol=1e-9)
-    again, valid = rays_from_air(space, table2, back, slopes_back, points[:, 2])
-    assert valid.all()
-    np.testing.assert_allclose(again, points[:, :2], atol=1e-12)
+    assert_rays_go_back(behind(sampled(of_third_degree)), table2, *points_and_crossings(rng, 200))
 
 
 def test_the_normal_changes_along_heights(table2: Camera) -> None:
@@ -184,6 +166,6 @@ def test_what_is_no_grid_is_refused(heights: tuple[tuple[float, ...], ...], word
         HeightMap(heights, (1.0, 1.0))
 
 
-def test_a_grid_beside_the_optical_axis_is_refused() -> None:
+def test_what_is_no_grid_or_beside_the_axis_is_refused() -> None:
     with pytest.raises(ConfigError, match="the optical axis goes past the grid of heights"):
         sampled(of_third_degree, half=(2.0, 1.5), centre=(2.1, 0.0, 0.0)).shape()

@@ -45,7 +45,7 @@ def picture(path: Path, value: float) -> Path:
 @pytest.mark.thorough
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e300, 1e30])
 @pytest.mark.parametrize("option", ["--dark", "--background", "--mask"])
-def test_a_reference_that_holds_no_counts_is_the_inputs_fault(
+def test_a_reference_without_counts_is_the_inputs_fault(
     tmp_path: Path, weights: Path, option: str, value: float
 ) -> None:
     image = picture(tmp_path / "reference.tif", value)
@@ -77,9 +77,7 @@ def test_figures_that_are_no_numbers_are_null(capsys: pytest.CaptureFixture[str]
 
 
 @pytest.mark.thorough
-def test_images_without_a_number_are_judged_in_json(
-    tmp_path: Path, weights: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_images_without_numbers_are_judged(tmp_path: Path, weights: Path, capsys: pytest.CaptureFixture[str]) -> None:
     tifffile.imwrite(tmp_path / "a.tif", np.full((ROWS, COLUMNS), np.nan, np.float32))
     assert ended("check", weights.with_name("rig.yaml"), tmp_path / "a.tif", "--json")[0] in (0, 4)
     text = capsys.readouterr().out
@@ -429,9 +427,7 @@ def test_bytes_after_what_is_too_short_are_no_pixels(tmp_path: Path, layout: dic
 
 
 @pytest.mark.parametrize("kind", ["a strip that is too long", "a PNG that is too long", "no image"])
-def test_gigabytes_that_are_no_image_are_refused_unread(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
-) -> None:
+def test_gigabytes_of_no_image_are_refused_unread(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str) -> None:
     path = tmp_path / ("big.png" if "PNG" in kind else "big.tif")
     image = np.full((ROWS, COLUMNS), 100, np.uint16)
     if kind == "a strip that is too long":

@@ -39,14 +39,11 @@ def test_a_background_needs_two_images_of_one_shape(background, expected):
         background([a, b.T])
 
 
-def test_saturated_pixels_are_those_at_the_end_of_a_scale():
+def test_saturated_pixels_are_at_the_end_of_a_scale_and_defects_stand_out_of_the_noise(rng):
     image = np.array([[4095.0, 4094.0, np.nan, np.inf]], np.float32)
     np.testing.assert_array_equal(saturated(image), [[True, False, True, True]])
     assert not saturated(np.array([[4090.0, 4090.0]], np.float32)).any()
     np.testing.assert_array_equal(saturated(image, 4094.0), [[True, True, True, True]])
-
-
-def test_defects_stand_out_of_the_noise_of_a_dark_image(rng):
     dark = np.rint(rng.normal(96.0, 6.0, (300, 300))).astype(np.float32)
     assert not defects(dark).any()
     dark[40, 50], dark[120, 0] = 300.0, 0.0
@@ -54,13 +51,17 @@ def test_defects_stand_out_of_the_noise_of_a_dark_image(rng):
     assert not defects(np.full((4, 4), 96.0, np.float32)).any()
 
 
-def test_unusable_pixels_are_filled_from_their_usable_neighbours():
+def test_unusable_pixels_are_filled_and_excluded_ones_may_be_lit():
     image = np.arange(25.0, dtype=np.float32).reshape(5, 5)
     unusable = np.zeros((5, 5), bool)
     unusable[1, 1] = True
     assert filled(np.where(unusable, np.float32(9e9), image), unusable)[1, 1] == 6.0  # of 0 1 2 5 7 10 11 12
     np.testing.assert_array_equal(filled(image, unusable)[~unusable], image[~unusable])
     assert not filled(image, np.ones((5, 5), bool)).any()
+    image = np.array([[1.0, 9.0, 5.0, 7.0]], np.float32)
+    excluded = np.array([[True, False, False, False]])
+    np.testing.assert_allclose(as_if_lit(image, excluded), [[9.0, 9.0, 5.0, 7.0]], rtol=1e-3)
+    assert not as_if_lit(image, np.ones((1, 4), bool)).any()
 
 
 def test_pixels_touched_by_unusable_ones_in_another_frame():
@@ -81,10 +82,3 @@ def test_noise_alone_leaves_this_residual(rng):
     # without the photons of a count only the read noise is known
     assert noise_residual(recorded.astype(np.float32)) == pytest.approx(6.0 * 400 / np.linalg.norm(recorded), rel=0.02)
     assert noise_residual(np.zeros((3, 3), np.float32)) == 0.0
-
-
-def test_excluded_pixels_may_be_lit():
-    image = np.array([[1.0, 9.0, 5.0, 7.0]], np.float32)
-    excluded = np.array([[True, False, False, False]])
-    np.testing.assert_allclose(as_if_lit(image, excluded), [[9.0, 9.0, 5.0, 7.0]], rtol=1e-3)
-    assert not as_if_lit(image, np.ones((1, 4), bool)).any()

@@ -24,8 +24,8 @@ from lfpiv_cli.verbs.calibrate import CalibrateOptions, calibrate_snapshot
 from lfpiv_cli.verbs.init import SCHEMA_NAME, InitOptions, init
 from lfpiv_cli.verbs.planning import bench_of, windows_line
 from lfpiv_cli.weights.columns import seen_share
+from tests.commands import ROOT
 
-ROOT = Path(__file__).parents[1]
 CONFIGS = sorted((ROOT / "configs").glob("*.yaml"))
 OWN = RigNumbers(magnification=-0.5, pitch_mm=0.125, columns=3000, rows=2000)
 RIGS = {
@@ -109,11 +109,17 @@ def test_answers_are_asked_for_and_followed(tmp_path: Path) -> None:
     assert told["reconstruction"]["wavelength_nm"] == told["simulation"]["light"]["wavelength_nm"] == 633.0
 
 
-@pytest.mark.parametrize(("answer", "expected"), [("-0.5", -0.5), ("0.5", -0.5), ("0\n2", -2.0)])
-def test_a_magnification_is_negative_with_or_without_its_minus(answer: str, expected: float, tmp_path: Path) -> None:
-    done = typed(answer + 15 * "\n", str(tmp_path / "rig.yaml"))
-    assert done.exit_code == 0, done.output
-    assert load_config(tmp_path / "rig.yaml").sections.camera.main_lens.magnification == expected
+def test_answers_that_cannot_be_are_asked_again_and_a_magnification_is_negative(tmp_path: Path) -> None:
+    path = tmp_path / "rig.yaml"
+    for answer, expected in (("-0.5", -0.5), ("0.5", -0.5), ("0\n2", -2.0)):
+        done = typed(answer + 15 * "\n", str(path), "--overwrite")
+        assert done.exit_code == 0, done.output
+        assert load_config(path).sections.camera.main_lens.magnification == expected
+    for answer in ("105 furlongs", "0 mm", "mm", "-5 cm", "1e400 m"):
+        done = typed(f"\n{answer}\n10.5 cm\n" + 15 * "\n", str(path), "--overwrite")
+        assert done.exit_code == 0, done.output
+        assert "expected a number above 0" in done.stderr or "is no number" in done.stderr
+        assert load_config(path).sections.camera.main_lens.focal_length_mm == 105.0
 
 
 # Magnification, focal length, pitch, microlenses, aperture, pixels, columns, rows, fluid, wall, its thickness, channel,
@@ -143,14 +149,6 @@ def test_lengths_are_understood_with_their_units_and_a_turned_sign_is_said(spell
     assert ("magnification: taken as -0.7, because the image is inverted" in done.stderr) == (words[0] != "-")
 
 
-@pytest.mark.parametrize("answer", ["105 furlongs", "0 mm", "mm", "-5 cm", "1e400 m"])
-def test_what_is_no_length_is_asked_again(answer: str, tmp_path: Path) -> None:
-    done = typed(f"\n{answer}\n10.5 cm\n" + 15 * "\n", str(tmp_path / "rig.yaml"))
-    assert done.exit_code == 0, done.output
-    assert "expected a number above 0" in done.stderr or "is no number" in done.stderr
-    assert load_config(tmp_path / "rig.yaml").sections.camera.main_lens.focal_length_mm == 105.0
-
-
 def test_nothing_is_asked_before_an_existing_file_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "rig.yaml"
     path.write_text("mine")
@@ -162,15 +160,15 @@ def test_nothing_is_asked_before_an_existing_file_is_refused(tmp_path: Path) -> 
     assert path.read_text() == "mine"
 
 
-@pytest.mark.parametrize("name", LATTICES)
-def test_microscopes_are_those_of_the_configs(name: Any, tmp_path: Path) -> None:
-    init(tmp_path / "rig.yaml", InitOptions(camera=name))
-    assert load_config(tmp_path / "rig.yaml").resolved() == load_config(ROOT / "configs" / f"{name}.yaml").resolved()
+def test_cameras_are_those_of_the_configs(tmp_path: Path) -> None:
+    def written(name: Any) -> tuple[Config, Config]:
+        init(tmp_path / f"{name}.yaml", InitOptions(camera=name))
+        return load_config(tmp_path / f"{name}.yaml"), load_config(ROOT / "configs" / f"{name}.yaml")
 
-
-def test_the_papers_camera_is_that_of_table_2(tmp_path: Path) -> None:
-    init(tmp_path / "rig.yaml", InitOptions(camera="table2"))
-    ours, papers = (load_config(path) for path in (tmp_path / "rig.yaml", ROOT / "configs" / "table2.yaml"))
+    for name in LATTICES:
+        ours, shipped = written(name)
+        assert ours.resolved() == shipped.resolved()
+    ours, papers = written("table2")
     first, second = ours.camera_model(), papers.camera_model()
     for name in ("magnification", "focal_length_mm", "aperture_mm", "microlens_distance_mm", "pixel_mm", "columns"):
         assert getattr(first, name) == getattr(second, name)
@@ -187,19 +185,11 @@ def test_what_a_calibration_was_made_with_is_written_again(tmp_path: Path) -> No
     assert load_config(tmp_path / "rig.yaml").resolved() == load_config(sample).resolved()
 
 
-def test_one_source_is_needed(tmp_path: Path) -> None:
+def test_one_source_is_needed_and_a_volume_that_the_sensor_sees(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="2 of them"):
         init(tmp_path / "rig.yaml", InitOptions(camera="guv", numbers=RigNumbers()))
     with pytest.raises(UsageError, match="one file"):
-        raise_again(typed("", "a.yaml", "-o", "b.yaml"))
-
-
-def raise_again(done: Result) -> None:
-    assert done.exception is not None
-    raise done.exception
-
-
-def test_a_volume_that_no_sensor_sees_is_refused() -> None:
+        raise typed("", "a.yaml", "-o", "b.yaml").exception
     with pytest.raises(ConfigError, match="sees no point"):
         tree_of(RigNumbers(columns=40, rows=40, channel_mm=20.0))
 

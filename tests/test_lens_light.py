@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.calibration.lattice import lattice_through
 from lfpiv_cli.calibration.lens_light import PARTS, Cells, LensImages, folded
 from lfpiv_cli.calibration.light_checks import dark_notices, level_notices, position_notices, uniform_notices
@@ -33,7 +33,7 @@ def images(lattice: Lattice, table2: Camera) -> LensImages:
     return LensImages.of(Rectification(sheet_fit(camera), SHAPE), None, 2.0 * RADIUS_PX / PITCH_PX)
 
 
-def uniform(lattice: Lattice, shift_px: Sequence[float] = (0.0, 0.0)) -> NDArray[np.float64]:
+def uniform(lattice: Lattice, shift_px: Sequence[float] = (0.0, 0.0)) -> Floats:
     """Return uniform light on lens images that have moved."""
     place = places() - np.array(shift_px)
     distance = np.linalg.norm(place - lattice.points(lattice.nearest(place)), axis=-1)
@@ -42,7 +42,7 @@ def uniform(lattice: Lattice, shift_px: Sequence[float] = (0.0, 0.0)) -> NDArray
 
 def tracers(
     lattice: Lattice, shift_px: Sequence[float] = (0.0, 0.0), *, share: float = 0.3, tilt: float = 0.0, seed: int = 0
-) -> NDArray[np.float64]:
+) -> Floats:
     """Return light that is bright behind a share of the lenses, more to the right of each, and noise."""
     rng = np.random.default_rng(seed)
     lens = lattice.nearest(places() - np.array(shift_px)) - lattice.nearest(places()).min(axis=(0, 1)) + 2
@@ -53,12 +53,12 @@ def tracers(
     return lit + rng.normal(0.0, NOISE, SHAPE)
 
 
-def places() -> NDArray[np.float64]:
+def places() -> Floats:
     row, column = np.indices(SHAPE)
     return np.stack([column, row], axis=-1).astype(float)
 
 
-def codes(images: LensImages, picture: NDArray[np.float64]) -> list[str]:
+def codes(images: LensImages, picture: Floats) -> list[str]:
     return [notice.code for notice in position_notices(images, picture, "a", "b")]
 
 
@@ -99,9 +99,7 @@ def test_folding_follows_a_lattice_that_is_bent(lattice: Lattice, table2: Camera
 @pytest.mark.thorough
 @pytest.mark.parametrize("shift", [(0.0, 0.0), (0.3, 0.0), (-2.4, 3.1)])
 @pytest.mark.parametrize("tilt", [0.0, 0.4])
-def test_shift_is_found_within_its_error(
-    images: LensImages, lattice: Lattice, shift: tuple[float, float], tilt: float
-) -> None:
+def test_shift_is_found_so_well(images: LensImages, lattice: Lattice, shift: tuple[float, float], tilt: float) -> None:
     found = images.beside(tracers(lattice, shift, tilt=tilt))
     assert found.lit
     assert found.following == pytest.approx(1.0, abs=0.25)
@@ -122,13 +120,15 @@ def test_stated_errors_are_those_made(images: LensImages, lattice: Lattice) -> N
 
 
 @pytest.mark.thorough
-def test_a_lattice_that_has_turned_is_told(images: LensImages, lattice: Lattice) -> None:
+def test_other_lattices_and_offsets_are_told(images: LensImages, lattice: Lattice) -> None:
     turned = Lattice.regular(PITCH_PX, lattice.layout, np.deg2rad(1.0), lattice.origin)
     assert codes(images, tracers(turned)) == ["lens-images-moved"]
+    other = Lattice.regular(1.21 * PITCH_PX, lattice.layout, 0.1, (95.0, 80.0))
+    assert codes(images, tracers(other)) == ["light-off-lens-images"]
 
 
 @pytest.mark.thorough
-def test_too_little_light_tells_nothing(images: LensImages, lattice: Lattice, rng: np.random.Generator) -> None:
+def test_little_light_and_rounding_tell_nothing(images: LensImages, lattice: Lattice, rng: np.random.Generator) -> None:
     assert codes(images, rng.normal(0.0, NOISE, SHAPE)) == []
     # a tracer behind one lens, in the middle of one of the parts
     one = tracers(lattice, (3.0, 0.0), share=0.0)
@@ -137,11 +137,7 @@ def test_too_little_light_tells_nothing(images: LensImages, lattice: Lattice, rn
     assert codes(images, one) == []
     # bright pixels
     assert codes(images, rng.normal(0.0, NOISE, SHAPE) + 500.0 * (rng.random(SHAPE) < 1e-3)) == []
-
-
-@pytest.mark.thorough
-def test_rounding_is_no_light(images: LensImages, lattice: Lattice, rng: np.random.Generator) -> None:
-    """A few counts of light, of a sensor whose noise is less than one count."""
+    # A few counts of light, of a sensor whose noise is less than one count.
     faint = 0.02 * tracers(lattice, share=0.1) + rng.normal(0.0, 0.5, SHAPE)
     assert images.background(np.rint(faint))[1] == pytest.approx(0.8, abs=0.2)
     assert images.beside(np.rint(faint)).following > 0.7
@@ -149,20 +145,10 @@ def test_rounding_is_no_light(images: LensImages, lattice: Lattice, rng: np.rand
 
 
 @pytest.mark.thorough
-def test_light_of_another_camera_is_told(images: LensImages, lattice: Lattice) -> None:
-    other = Lattice.regular(1.21 * PITCH_PX, lattice.layout, 0.1, (95.0, 80.0))
-    assert codes(images, tracers(other)) == ["light-off-lens-images"]
-
-
-@pytest.mark.thorough
-@pytest.mark.parametrize(
-    ("offset", "told"), [(0.0, []), (2.0 * NOISE, []), (60.0, ["dark-level"]), (-60.0, ["dark-level"])]
-)
-def test_offset_between_lens_images_is_told(
-    images: LensImages, lattice: Lattice, offset: float, told: list[str]
-) -> None:
-    picture = tracers(lattice, share=0.1) + offset
-    assert [notice.code for notice in level_notices(images, picture, "a")] == told
+def test_offset_between_lens_images_is_told(images: LensImages, lattice: Lattice) -> None:
+    picture = tracers(lattice, share=0.1)
+    for offset, told in ((0.0, []), (2.0 * NOISE, []), (60.0, ["dark-level"]), (-60.0, ["dark-level"])):
+        assert [notice.code for notice in level_notices(images, picture + offset, "a")] == told
 
 
 @pytest.mark.thorough

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.optics.camera import Camera, Lattice
 from lfpiv_cli.optics.line_responses import PHASES, LineResponses
@@ -37,7 +37,7 @@ def view() -> View:
     return raw_view(camera_of(), WATER, 0.0, None, SPACE, Light(GREEN_MM, DIFFUSION_PX, DEPTHS))
 
 
-def response(view: View, point: tuple[float, float, float]) -> NDArray[np.float64]:
+def response(view: View, point: tuple[float, float, float]) -> Floats:
     """Return the light and its derivatives (4, rows, columns) of a particle."""
     room = room_for(1, entry_capacity(view, *DEPTHS), 0)
     respond_all(view, np.array([[*point, 1.0]]), room)
@@ -48,7 +48,7 @@ def response(view: View, point: tuple[float, float, float]) -> NDArray[np.float6
     return found.reshape(4, PIXELS, PIXELS)
 
 
-def by_waves(camera: Camera, points: NDArray[np.float64]) -> NDArray[np.float64]:
+def by_waves(camera: Camera, points: Floats) -> Floats:
     """Return the light of points by waves that are propagated over the whole image."""
     image = np.zeros((PIXELS, PIXELS))
     patch = WavesInCamera(replace(camera, diffusion_px=DIFFUSION_PX), SPACE, Waves(GREEN_MM)).patch(points)
@@ -91,21 +91,20 @@ def test_derivatives_are_differences(view: View, point: tuple[float, float, floa
         assert np.abs(derivatives[axis][both] - difference).sum() < 0.02 * np.abs(difference).sum()
 
 
-def _spline(t: float) -> NDArray[np.float64]:
-    """Return the weights of four coefficients of a cubic spline, by B-splines about each."""
-    away = np.abs(np.array([1.0, 0.0, -1.0, -2.0]) + t)
-    return np.where(away < 1.0, 2.0 / 3.0 - away**2 + 0.5 * away**3, np.maximum(2.0 - away, 0.0) ** 3 / 6.0)
-
-
-def _line(lines: LineResponses, offset: float, depth: float, u_px: float) -> NDArray[np.float64]:
+def _line(lines: LineResponses, offset: float, depth: float, u_px: float) -> Floats:
     """Return the response (terms,) at one place, read from the table as it is described."""
     table = np.asarray(lines.table, np.float64)
+
+    def spline(t: float) -> Floats:  # weights of four coefficients of a cubic one, by B-splines about each
+        away = np.abs(np.array([1.0, 0.0, -1.0, -2.0]) + t)
+        return np.where(away < 1.0, 2.0 / 3.0 - away**2 + 0.5 * away**3, np.maximum(2.0 - away, 0.0) ** 3 / 6.0)
+
     places = (
         (depth - lines.first_depth_mm) / lines.depth_step_mm,
         offset / lines.offset_step_mm + 0.5 * (table.shape[1] - 1),
         (u_px + 0.5 * table.shape[4]) * PHASES,
     )
-    (z, x, u), by = np.floor(places).astype(int), [_spline(place % 1.0) for place in places]
+    (z, x, u), by = np.floor(places).astype(int), [spline(place % 1.0) for place in places]
     fine = table[z - 1 : z + 3, x - 1 : x + 3].transpose(0, 1, 4, 2, 3).reshape(4, 4, -1, table.shape[3])
     return np.asarray(np.einsum("a,b,c,abck->k", *by, fine[:, :, u - 1 : u + 3]))
 

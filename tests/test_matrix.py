@@ -1,7 +1,7 @@
 """Every kind of file that commands write, in every place where a command takes a file: taken, or refused in a sentence.
 
 A new command, or a new place for a file in one, is a line in `PLACES`; a new kind of file is one in `KINDS`, beside
-what writes it; a new format of exports is one in `READERS`. `python -m tests.test_matrix` prints the whole matrix.
+what writes it; a new format of exports is one in `READERS`.
 """
 
 from __future__ import annotations
@@ -9,11 +9,8 @@ from __future__ import annotations
 import os
 import re
 import shutil
-import sys
 from collections.abc import Iterable, Iterator
-from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass, field
-from io import StringIO
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -51,7 +48,6 @@ OF_FORMATS = {
 }
 RESULTS = {"volume", *VECTORS, *PARTICLES, *TRACKS}
 DRAWN = RESULTS | CALIBRATIONS | WEIGHTS
-
 
 # What is no file; a folder is one to places that take files by the thousand, but holds none.
 NO_FILES = ("missing", "empty", "folder", *(["pipe"] if hasattr(os, "mkfifo") else []))
@@ -211,13 +207,9 @@ def wanted(place: Place, kind: str) -> set[str]:
     return {f"refused {place.refusal}", *(["ok"] if kind in place.may else [])}
 
 
-def row(files: WrittenFiles, name: str, kinds: Iterable[str] = (*KINDS, *NO_FILES)) -> dict[str, str]:
-    """Return how the command of a place ends with each kind."""
-    return {kind: outcome(files, PLACES[name], kind) for kind in kinds}
-
-
-def faults(name: str, found: dict[str, str]) -> dict[str, str]:
-    """Return what of a row is not as it should be."""
+def faults(files: WrittenFiles, name: str, kinds: Iterable[str] = (*KINDS, *NO_FILES)) -> dict[str, str]:
+    """Return how the command of a place ends with kinds of files that it should treat otherwise."""
+    found = {kind: outcome(files, PLACES[name], kind) for kind in kinds}
     return {kind: got for kind, got in found.items() if got not in wanted(PLACES[name], kind)}
 
 
@@ -249,14 +241,13 @@ def test_each_format_has_its_kinds_and_its_reader() -> None:
 
 @pytest.mark.parametrize("name", ["init --from", "check CONFIG", "info FILE", "export --to csv"])
 def test_what_is_made_in_no_time_is_taken_or_refused(tmp_path: Path, name: str) -> None:
-    found = row(WrittenFiles(tmp_path), name, ["rig", "schema", "weights without calibration", *NO_FILES])
-    assert not faults(name, found)
+    assert not faults(WrittenFiles(tmp_path), name, ["rig", "schema", "weights without calibration", *NO_FILES])
 
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("name", PLACES)
 def test_each_kind_is_taken_or_refused_in_a_sentence(files: WrittenFiles, name: str) -> None:
-    assert not faults(name, row(files, name))
+    assert not faults(files, name)
 
 
 @pytest.mark.thorough
@@ -294,26 +285,3 @@ def datasets_of(file: h5py.File) -> Iterator[tuple[str, str]]:
     for path in paths:
         if isinstance(file[path], h5py.Dataset) and (OF_DATA.match(path) or not path.startswith("VTKHDF/")):
             yield path, file[path].attrs.get("units", b"").decode()
-
-
-def main(folder: Path) -> None:
-    """Print the matrix: a row for each kind, a column for each place."""
-    files = WrittenFiles(folder)
-    marks: dict[str, dict[str, str]] = {}
-    for name in PLACES:
-        with redirect_stdout(StringIO()), redirect_stderr(StringIO()):
-            marks[name] = row(files, name)
-        for kind, got in faults(name, marks[name]).items():
-            print(f"{name}: {kind}: {got}", file=sys.stderr, flush=True)
-    print("ok: taken; a number: refused in one sentence, nothing written, with this exit code; !!: neither\n")
-    for number, name in enumerate(PLACES, 1):
-        print(f"{number:4d}  {name}")
-    print(f"\n{'':28}" + "".join(f"{number:4d}" for number in range(1, len(PLACES) + 1)))
-    for kind in (*KINDS, *NO_FILES):
-        cells = [marks[name][kind].removeprefix("refused ") for name in PLACES]
-        print(f"{kind:28}" + "".join(f"{cell if len(cell) < 3 else '!!':>4}" for cell in cells))
-
-
-if __name__ == "__main__":
-    with TemporaryDirectory() as made:
-        main(Path(made))

@@ -9,9 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-import yaml
 from click.testing import CliRunner
-from test_info import RIG
 
 from lfpiv_cli.cli.main import cli
 from lfpiv_cli.errors import InputError, UsageError
@@ -30,6 +28,7 @@ from lfpiv_cli.files.vtkhdf import write_volume
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.reference import Reference
 from lfpiv_cli.verbs.plot import figures_of
+from tests.commands import table2_rig
 
 pytest.importorskip("matplotlib")
 
@@ -45,7 +44,7 @@ def run(*arguments: str) -> str:
 @pytest.fixture
 def config(tmp_path):
     path = tmp_path / "rig.yaml"
-    path.write_text(yaml.safe_dump(RIG))
+    path.write_text(table2_rig(240, 200, volume={"shape_xyz": [5, 4, 3], "voxel_mm": [0.1, 0.1, 0.4]}))
     return path
 
 

@@ -1,19 +1,20 @@
-"""The tracers' diameter by their images: true sizes come out whatever was assumed, and contradictions are told."""
+"""The tracers' diameter and the sensor's diffusion by images: what is true comes out, and what contradicts is told."""
 
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.files.config import load_config
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.camera import Camera, Lattice
+from lfpiv_cli.optics.line_responses import USUAL_DIFFUSION_PX
 from lfpiv_cli.optics.media import Media
 from lfpiv_cli.particles.diameter import NO_SIZES, Diameter, Sizes, Trial, _settled_sizes, diameter_by, diameter_of
+from lfpiv_cli.particles.diffusion import MODEL_SHARE, MODEL_SQUARES, Forms, forms_of, together_of
 from lfpiv_cli.particles.fitting import add_all
 from lfpiv_cli.particles.search import Task, task_of
 from lfpiv_cli.particles.view import Light, entry_capacity, raw_view, with_radius
@@ -21,9 +22,9 @@ from lfpiv_cli.reconstruction.solvers import normalisers
 from lfpiv_cli.verbs.tracers import Diffusion, TracerSize, size_notices
 from lfpiv_cli.weights.build import default_padding, factorise
 from lfpiv_cli.weights.model import Weights
-from tests.particle_twin import entries_of
+from tests.commands import ROOT
+from tests.particle_twin import respond_once
 
-ROOT = Path(__file__).parent.parent
 LENS_MM = 0.1
 DEPTHS_MM = (0.4, 2.1)
 
@@ -33,9 +34,7 @@ def rng() -> np.random.Generator:
     return np.random.default_rng(5)
 
 
-def image_of(
-    camera: Camera, media: Media, tracers: NDArray[np.float64], lenses: float, waves: Light | None = None
-) -> NDArray[np.float64]:
+def image_of(camera: Camera, media: Media, tracers: Floats, lenses: float, waves: Light | None = None) -> Floats:
     """Return what tracers (n, 4) of a diameter in microlenses show, without noise."""
     image = np.zeros(camera.rows * camera.columns)
     add_all(raw_view(camera, media, 0.5 * lenses * LENS_MM, light=waves), tracers, 1.0, image, DEPTHS_MM)
@@ -45,7 +44,7 @@ def image_of(
 def tasks_of(
     camera: Camera,
     media: Media,
-    images: list[NDArray[np.float64]],
+    images: list[Floats],
     rng: np.random.Generator,
     assumed: float = 0.5,
     waves: Light | None = None,
@@ -62,7 +61,7 @@ def tasks_of(
 
 @pytest.mark.thorough
 @pytest.mark.parametrize(("lenses", "assumed"), [(0.1, 2.0), (0.5, 0.1), (2.0, 0.5)])
-def test_the_diameter_is_found_whatever_was_assumed(
+def test_the_diameter_is_found(
     table2: Camera, water: Media, rng: np.random.Generator, lenses: float, assumed: float
 ) -> None:
     camera = replace(table2, columns=260, rows=240)
@@ -79,7 +78,7 @@ def test_the_diameter_is_found_whatever_was_assumed(
 
 
 @pytest.mark.thorough
-def test_by_waves_diffusion_is_found_along_with_the_diameter(
+def test_by_waves_diffusion_is_found_beside_the_diameter(
     table2: Camera, water: Media, rng: np.random.Generator
 ) -> None:
     camera = replace(table2, columns=260, rows=240)
@@ -96,7 +95,7 @@ def test_by_waves_diffusion_is_found_along_with_the_diameter(
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("number", [60, 400])
-def test_the_diameter_of_crowded_tracers_is_right_or_none(
+def test_crowded_diameters_are_right_or_none(
     table2: Camera, water: Media, rng: np.random.Generator, number: int
 ) -> None:
     # Some .9 and 6 tracers for each microlens.
@@ -109,9 +108,7 @@ def test_the_diameter_of_crowded_tracers_is_right_or_none(
 
 
 @pytest.mark.thorough
-def test_frames_are_taken_until_they_hold_enough_tracers(
-    table2: Camera, water: Media, rng: np.random.Generator
-) -> None:
+def test_frames_are_taken_until_tracers_suffice(table2: Camera, water: Media, rng: np.random.Generator) -> None:
     camera = replace(table2, columns=260, rows=240)
     dark = np.zeros((camera.rows, camera.columns))
     assert diameter_by(tasks_of(camera, water, [dark], rng)) is None
@@ -123,7 +120,7 @@ def test_frames_are_taken_until_they_hold_enough_tracers(
     assert found.lenses == pytest.approx(0.8, abs=0.03)
 
 
-def test_sizes_of_frames_are_pooled_and_a_point_has_a_limit() -> None:
+def test_sizes_of_frames_are_pooled_and_a_point_has_a_limit(monkeypatch: pytest.MonkeyPatch) -> None:
     assert diameter_of([NO_SIZES]) is None
     square, sigma = np.array([0.25, 0.26, 0.24, 0.25, 4.0]), np.full(5, 0.01)
     found = diameter_of([Sizes(square[:2], sigma[:2]), NO_SIZES, Sizes(square[2:], sigma[2:])])
@@ -136,19 +133,34 @@ def test_sizes_of_frames_are_pooled_and_a_point_has_a_limit() -> None:
     assert not point.resolved
     # Three tracers know a square to 0.012.
     assert 0.1 < point.lenses + 3.0 * point.sigma_lenses < 0.25
+    # The two images of a pair are looked at; the second search begins with what the first one showed.
+    squares, begun = iter([0.25, 0.36, 0.49]), []
+    enough = np.full(10, 0.01)
+
+    def measured(_: object, diameter: float | None) -> Sizes:
+        begun.append(diameter)
+        return Sizes(next(squares) + 0 * enough, enough)
+
+    monkeypatch.setattr("lfpiv_cli.particles.diameter.measured_sizes", measured)
+    found = diameter_by([None, None, None])  # type: ignore[list-item]
+    assert found is not None
+    assert [each.lenses for each in found.frames] == pytest.approx([0.5, 0.6])
+    assert found.tracers == 20
+    assert begun == [None, pytest.approx(0.5)]
 
 
 @pytest.mark.thorough
 def test_a_view_of_other_balls_is_that_made_for_them(table2: Camera, water: Media) -> None:
     for layout in ("square", "hexagonal"):
         camera = replace(table2, columns=120, rows=110, lattice=Lattice.regular(0.1, layout))
-        tracer = np.array([[0.02, -0.03, 1.3, 1.0]])
         small, large = (raw_view(camera, water, radius) for radius in (0.04, 0.1))
         lit = []
         for view in (with_radius(small, 0.1), large):
             image = np.zeros(camera.rows * camera.columns)
-            _, pixels, values = entries_of(view, tracer, entry_capacity(view, *DEPTHS_MM))
-            np.add.at(image, pixels, values[:, 0])
+            room = entry_capacity(view, *DEPTHS_MM)
+            pixels, values = np.empty(room, np.int32), np.empty((room, 4))
+            count = respond_once(view, 0.02, -0.03, 1.3, pixels, values)
+            image[pixels[:count]] = values[:count, 0]
             lit.append(image)
         np.testing.assert_allclose(lit[0], lit[1], atol=1e-12)
 
@@ -174,7 +186,7 @@ def test_notices_of_the_diameter(given: float | None, size: TracerSize, codes: l
 def test_a_size_that_grows_beyond_all_tracers_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
     searched = []
 
-    def grown(task: None, found: None, diameters: NDArray[np.float64], unexplained: float) -> Trial:
+    def grown(task: None, found: None, diameters: Floats, unexplained: float) -> Trial:
         return Trial(1.2 * float(diameters.max()), np.zeros((5, 12)), np.ones(12, np.bool_))
 
     monkeypatch.setattr("lfpiv_cli.particles.diameter._found", lambda _, size, __: (None, searched.append(size)))
@@ -202,31 +214,125 @@ def test_images_that_contradict_each_other_are_told() -> None:
     assert [each.about for each in both] == ["reconstruction.particle_diameter_mm", "reconstruction.diffusion_px"]
 
 
-def test_the_two_images_of_a_pair_are_looked_at(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The second search begins with what the first one showed."""
-    squares, begun = iter([0.25, 0.36, 0.49]), []
-    enough = np.full(10, 0.01)
-
-    def measured(_: object, diameter: float | None) -> Sizes:
-        begun.append(diameter)
-        return Sizes(next(squares) + 0 * enough, enough)
-
-    monkeypatch.setattr("lfpiv_cli.particles.diameter.measured_sizes", measured)
-    found = diameter_by([None, None, None])  # type: ignore[list-item]
-    assert found is not None
-    assert [each.lenses for each in found.frames] == pytest.approx([0.5, 0.6])
-    assert found.tracers == 20
-    assert begun == [None, pytest.approx(0.5)]
-
-
-def test_files_state_an_error_where_the_diameter_is_by_the_images() -> None:
+def test_files_state_errors_of_diameters_and_limits_in_units_of_the_scene() -> None:
     assert TracerSize(0.05, 0.051, 0.002, True).attributes() == {"particle_diameter_mm": 0.05}
     by_images = {"particle_diameter_mm": 0.051, "particle_diameter_sigma_mm": 0.002}
     assert TracerSize(0.051, 0.051, 0.002, True).attributes() == by_images
     assert TracerSize(0.05, 0.051, 0.002).summary()["particle_diameter_measured_mm"] == 0.051
-
-
-def test_a_limit_is_told_in_units_of_the_scene() -> None:
     assert TracerSize(0.01, 0.01, 0.02).at_most_mm == pytest.approx(0.07)
     assert TracerSize(0.05).at_most_mm is None
     assert Diameter(0.5, 0.1, 3).resolved
+
+
+SIZE, BLUR_PX = 0.5, 0.25
+SQUARES = np.square([SIZE, BLUR_PX])
+
+
+def forms(count: int, rng: np.random.Generator, sure: float = 1.0) -> Forms:
+    """Return what tracers that scatter as they state say of the squares, each of one mixture of both or another."""
+    turn = rng.uniform(0.2, 1.2, count)
+    ways = np.stack([np.cos(turn), np.sin(turn)], axis=-1) / 0.01 * sure
+    matrix = np.einsum("ni,nj->nij", ways, ways) + 25.0 * sure**2 * np.eye(2)
+    noise = np.linalg.cholesky(matrix) @ rng.normal(size=(count, 2, 1))
+    return Forms(matrix, matrix @ SQUARES + noise[..., 0])
+
+
+def test_both_are_found_and_their_errors_are_those_of_the_scatter(rng: np.random.Generator) -> None:
+    away = []
+    # What the model gets wrong is in the covariance and not in these forms.
+    model = np.square([np.hypot(2.0 * MODEL_SHARE * SQUARES[0], MODEL_SQUARES[0]), MODEL_SQUARES[1]])
+    for _ in range(200):
+        found = together_of([forms(15, rng), forms(15, rng)])
+        noise = found.covariance - np.diag(model)
+        miss = np.square([found.lenses, found.diffusion_px]) - SQUARES
+        away.append(miss @ np.linalg.solve(noise, miss))
+    # Chi-squared of two, its mean of 200 known to 7 %; the scatter of 30 and their weights make errors larger.
+    assert np.mean(away) == pytest.approx(2.0, abs=0.5)
+
+
+def test_tracers_that_contradict_the_others_hardly_matter() -> None:
+    right = forms(30, np.random.default_rng(20260101))
+    wrong = Forms(right.matrix[:3], right.matrix[:3] @ (SQUARES + (0.5, 0.0)))
+    alone, both = together_of([right]), together_of([right, wrong])
+    assert abs(both.lenses - alone.lenses) < 0.01
+    # All alike they move it by .03 and more.
+    pooled = Forms(*(np.concatenate(parts) for parts in ((right.matrix, wrong.matrix), (right.right, wrong.right))))
+    square = np.linalg.solve(pooled.matrix.sum(axis=0), pooled.right.sum(axis=0))
+    assert np.sqrt(square[0]) - alone.lenses > 0.03
+
+
+def test_what_is_given_is_held_and_the_other_found_with_it_and_its_error(rng: np.random.Generator) -> None:
+    shown = [forms(40, rng)]
+    by_size = together_of(shown, lenses=SIZE)
+    assert by_size.lenses == pytest.approx(SIZE, abs=1e-6)
+    assert by_size.diffusion_px == pytest.approx(BLUR_PX, abs=0.01)
+    wrong = together_of(shown, diffusion_px=0.4)
+    assert wrong.diffusion_px == pytest.approx(0.4, abs=1e-6)
+    # More blur than there is asks for smaller tracers.
+    assert wrong.lenses < SIZE - 0.02
+    assert wrong.covariance[1, 1] < 1e-9
+    # What the model gets wrong of the size is in the diffusion's error where the size is given.
+    matrix = np.tile(np.array([[1e4, 9e3], [9e3, 1e4]]), (20, 1, 1))
+    shown = Forms(matrix, matrix @ (SQUARES + (MODEL_SQUARES[0], 0.0)))
+    found = together_of([shown], lenses=SIZE)
+    away = 0.9 * np.hypot(2.0 * MODEL_SHARE * SIZE**2, MODEL_SQUARES[0])
+    assert found.diffusion_px**2 - BLUR_PX**2 == pytest.approx(0.9 * MODEL_SQUARES[0], rel=0.05)
+    assert found.covariance[1, 1] == pytest.approx(away**2 + MODEL_SQUARES[1] ** 2, rel=0.1)
+    assert found.covariance[0, 0] < 1e-9
+
+
+def test_crowded_tracers_tell_diffusion_less_surely_and_others_what_is_usual(rng: np.random.Generator) -> None:
+    shown = forms(40, rng)
+    alone, few, many = (together_of([shown._replace(crowd=crowd)]) for crowd in (0.0, 0.5, 1.7))
+    assert few.sigma_px == alone.sigma_px
+    assert many.diffusion_px == alone.diffusion_px
+    # At 2 for each microlens, of which 1.7 are found, diffusion of 0.3 px seemed 0.19.
+    assert many.sigma_px > 0.03
+    # The most crowded of some images counts.
+    both = together_of([shown, shown._replace(crowd=1.7)])
+    assert both.sigma_px == pytest.approx(many.sigma_px, rel=0.05)
+    # What images do not tell is taken as usual.
+    told, untold = together_of([forms(20, rng)]), together_of([forms(20, rng, sure=1e-3)])
+    assert told.told
+    assert not untold.told
+    assert untold.diffusion_px == pytest.approx(USUAL_DIFFUSION_PX, abs=0.05)
+    # Sizes of points are not below 0, and diffusion is then that of points.
+    point = Forms(np.tile(1e4 * np.eye(2), (5, 1, 1)), np.tile(1e4 * np.array([-0.01, 0.04]), (5, 1)))
+    found = together_of([point])
+    assert found.lenses == 0.0
+    assert found.diffusion_px == pytest.approx(0.2, abs=0.01)
+
+
+def test_files_state_diffusion_and_its_error_where_it_is_not_given() -> None:
+    assert Diffusion(0.2, 0.31, 0.02, given=True, told=True).attributes() == {"diffusion_px": 0.2}
+    by_images = Diffusion(0.31, 0.31, 0.02, told=True)
+    assert by_images.attributes() == {"diffusion_px": 0.31, "diffusion_sigma_px": 0.02}
+    assert Diffusion(USUAL_DIFFUSION_PX).attributes()["diffusion_sigma_px"] == 0.1
+    size = TracerSize(0.05, 0.051, 0.002, True, by_images)
+    assert size.attributes() == {"particle_diameter_mm": 0.05, **by_images.attributes()}
+    assert size.summary()["diffusion_measured_px"] == 0.31
+    # Forms are those of the losses.
+    grid = np.array([(a, b) for a in (0.2, 0.25, 0.3) for b in (0.05, 0.09, 0.13)])
+    matrix, best = np.array([[300.0, 120.0], [120.0, 500.0]]), np.array([0.27, 0.06])
+    losses = np.einsum("mi,ij,mj->m", grid - best, matrix, grid - best)[:, np.newaxis] + 7.0
+    found = forms_of(grid, losses)
+    np.testing.assert_allclose(found.matrix[0], matrix, rtol=1e-6)
+    np.testing.assert_allclose(np.linalg.solve(found.matrix[0], found.right[0]), best, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("diffusion", "codes"),
+    [
+        (Diffusion(0.2, 0.21, 0.02, given=True, told=True), []),
+        (Diffusion(0.2, 0.31, 0.02, given=True, told=True), ["diffusion"]),
+        (Diffusion(0.31, 0.31, 0.02, told=True), []),
+        (Diffusion(0.31, 0.31, 0.09), ["diffusion-unknown"]),
+        (Diffusion(USUAL_DIFFUSION_PX), ["diffusion-unknown"]),
+        # What is given is used where the images do not tell.
+        (Diffusion(0.2, given=True), []),
+    ],
+)
+def test_notices_of_diffusion(diffusion: Diffusion, codes: list[str]) -> None:
+    settings = load_config(ROOT / "configs" / "table2.yaml")
+    size = TracerSize(0.05, 0.05, 0.002, True, diffusion)
+    assert [notice.code for notice in size_notices(settings, size)] == codes
