@@ -23,8 +23,7 @@ from lfpiv_cli.calibration.board_pose import BoardGeometry
 from lfpiv_cli.calibration.rectification import turned
 from lfpiv_cli.calibration.shape_fit import PointShape, ShapeFit, fit_shape, pixels_near, scene_points, scene_shares
 from lfpiv_cli.calibration.views import (
-    charuco_corners,
-    chessboard_corners,
+    board_corners,
     clear_mm,
     described,
     lens_table,
@@ -391,7 +390,7 @@ def first_corners(image: Singles, passed: Singles, camera: Camera, board: BoardG
                 "with larger ones"
             )
     picture, scale = enlarged_view(evenly_lit(image, passed), camera)
-    found = charuco_corners(picture, board) if board.pattern == "charuco" else chessboard_corners(picture, board)
+    found = board_corners(picture, board)
     if found is None:
         raise InputError(
             f"{described(board)} was not found in the picture; check board.pattern, board.squares, the exposure and "

@@ -26,15 +26,34 @@ from lfpiv_cli.optics.media import Media
 LEAST_CONTRAST = 60.0
 
 
-def chessboard_corners(picture: NDArray[np.uint8], board: BoardGeometry) -> tuple[Integers, Floats] | None:
-    """Return numbers and places (n, 2) of all inner corners of a chessboard; None where it is not wholly there."""
-    # CALIB_CB_NORMALIZE_IMAGE would equalise the histogram, which draws corners of small boards off by a square
-    flags = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY
-    there, corners = cv2.findChessboardCornersSB(picture, board.dots, flags=flags)
-    across, down = board.dots
-    if not there or not alternating(picture, np.asarray(corners, dtype=np.float64).reshape(down, across, 2)):
+def board_corners(picture: NDArray[np.uint8], board: BoardGeometry) -> tuple[Integers, Floats] | None:
+    """Return numbers and places (n, 2) of a board's inner corners.
+
+    All those of a chessboard, None where it is not wholly there; those of a ChArUco board that are seen, None where
+    none is.
+    """
+    every, (across, down) = board_numbers(board), board.dots
+    if board.pattern == "chessboard":
+        # CALIB_CB_NORMALIZE_IMAGE would equalise the histogram, which draws corners of small boards off by a square
+        flags = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY
+        there, corners = cv2.findChessboardCornersSB(picture, board.dots, flags=flags)
+        place = np.asarray(corners, dtype=np.float64).reshape(-1, 2) if there else np.zeros((0, 2))
+        return (every, place) if there and alternating(picture, place.reshape(down, across, 2)) else None
+    settings = cv2.aruco.CharucoParameters()
+    settings.minMarkers = 1  # of the two beside a corner: at the picture's edge one is cut
+    corners, identity, _, _ = cv2.aruco.CharucoDetector(charuco_board(board), settings).detectBoard(picture)
+    if corners is None or len(corners) == 0:
         return None
-    return board_numbers(board), np.asarray(corners, dtype=np.float64).reshape(-1, 2)
+    row, column = np.divmod(np.asarray(identity, dtype=np.int64).ravel(), across)
+    found = np.stack([column, row], axis=1)
+    if np.linalg.matrix_rank(found - found[0]) < 2:
+        return None
+    # OpenCV leaves out corners whose markers are cut; the others tell where they are
+    terms = np.column_stack([np.ones(len(found)), found])
+    grid = np.linalg.lstsq(terms, np.asarray(corners, dtype=np.float64).reshape(-1, 2), rcond=None)[0]
+    place = np.asarray(grid[0] + every @ grid[1:], dtype=np.float64)
+    inside = ((place >= 0.0) & (place <= np.array(picture.shape[::-1]) - 1.0)).all(axis=1)
+    return every[inside], place[inside]
 
 
 def alternating(picture: NDArray[np.uint8], corners: Floats) -> bool:
@@ -59,26 +78,6 @@ def alternating(picture: NDArray[np.uint8], corners: Floats) -> bool:
 def board_numbers(board: BoardGeometry) -> Integers:
     """Return the numbers (n, 2) of all corners along the board's columns and rows, row by row."""
     return np.stack(np.meshgrid(*(np.arange(n) for n in board.dots)), axis=-1).reshape(-1, 2).astype(np.int64)
-
-
-def charuco_corners(picture: NDArray[np.uint8], board: BoardGeometry) -> tuple[Integers, Floats] | None:
-    """Return numbers and places (n, 2) of the inner corners of a ChArUco board that are seen; None where none is."""
-    settings = cv2.aruco.CharucoParameters()
-    settings.minMarkers = 1  # of the two beside a corner: at the picture's edge one is cut
-    corners, identity, _, _ = cv2.aruco.CharucoDetector(charuco_board(board), settings).detectBoard(picture)
-    if corners is None or len(corners) == 0:
-        return None
-    row, column = np.divmod(np.asarray(identity, dtype=np.int64).ravel(), board.dots[0])
-    found = np.stack([column, row], axis=1)
-    if np.linalg.matrix_rank(found - found[0]) < 2:
-        return None
-    # OpenCV leaves out corners whose markers are cut; the others tell where they are
-    terms = np.column_stack([np.ones(len(found)), found])
-    grid = np.linalg.lstsq(terms, np.asarray(corners, dtype=np.float64).reshape(-1, 2), rcond=None)[0]
-    every = board_numbers(board)
-    place = np.asarray(grid[0] + every @ grid[1:], dtype=np.float64)
-    there = ((place >= 0.0) & (place <= np.array(picture.shape[::-1]) - 1.0)).all(axis=1)
-    return every[there], place[there]
 
 
 def charuco_board(board: BoardGeometry) -> cv2.aruco.CharucoBoard:

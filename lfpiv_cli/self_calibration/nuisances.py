@@ -248,11 +248,6 @@ class Nuisances:
     tilt_away_rad: float = 0.0
 
     @property
-    def values(self) -> Floats:
-        """Those of camera and particles as an array (5,), in the order of the attributes."""
-        return self.whole[:OF_CAMERA]
-
-    @property
     def scene(self) -> Floats:
         """Those of a scene (4,)."""
         return self.whole[OF_CAMERA:]
