@@ -32,7 +32,6 @@ from lfpiv_cli.synthetic.render import Balls, Readout, render_points, render_whi
 from lfpiv_cli.synthetic.scenes import Misalignment
 from lfpiv_cli.validation.planning import cramer_rao_bound, expected_image, pixel_variance, slopes
 from lfpiv_cli.validation.volume import match, particle_figures
-from lfpiv_cli.weights.build import default_padding, factorise
 from lfpiv_cli.weights.model import Weights
 
 WATER = Media(1.0, 1.49, 1.33)
@@ -140,8 +139,7 @@ def calibrated(shape: tuple[int, int], volume_xyz: tuple[int, int, int], seed: i
     calibration = _calibration(sheet, real, np.random.default_rng(seed))
     grid = Grid.centred(volume_xyz, (VOXEL_MM,) * 3, (0.0, 0.0, 0.0))
     camera = calibration.camera(sheet)
-    padding = default_padding(camera, WATER, grid)
-    weights = Weights(grid, padding, factorise(camera, WATER, grid.padded(padding)), camera.column_axis, calibration)
+    weights = Weights.factorised(camera, WATER, grid, calibration)
     return Bench(sheet, real, calibration, grid, weights, normalisers(weights.padded))
 
 
@@ -173,8 +171,7 @@ def print_errors_over_bound(shape: tuple[int, int], volume_xyz: tuple[int, int, 
     """Print the errors of tracers apart from each other, and of `count` strewn over the volume, over the bound."""
     camera = Camera(-1.0, 100.0, 25.0, 0.8, 0.8, Lattice.regular(0.1), 0.0055, shape[1], shape[0])
     grid = Grid.centred(volume_xyz, (VOXEL_MM,) * 3, (0.0, 0.0, 0.0))
-    padding = default_padding(camera, WATER, grid)
-    weights = Weights(grid, padding, factorise(camera, WATER, grid.padded(padding)), camera.column_axis, None)
+    weights = Weights.factorised(camera, WATER, grid)
     sums = normalisers(weights.padded)
     rng = np.random.default_rng(seed)
     low, high = (np.array([grid.bounds_mm(axis)[side] for axis in range(3)]) for side in (0, 1))

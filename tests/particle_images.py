@@ -15,7 +15,6 @@ from lfpiv_cli.particles.fitting import add_all
 from lfpiv_cli.particles.search import Task, task_of
 from lfpiv_cli.particles.view import raw_view
 from lfpiv_cli.reconstruction.solvers import normalisers
-from lfpiv_cli.weights.build import default_padding, factorise
 from lfpiv_cli.weights.model import Weights
 
 
@@ -23,8 +22,7 @@ def task_with(table2: Camera, water: Media, true: Floats, rng: np.random.Generat
     """Return the task that a noisy image of particles sets; `noise` in counts."""
     camera = replace(table2, columns=500, rows=420)
     grid = Grid.centred((20, 16, 20), (0.1, 0.1, 0.1), (0.0, 0.0, 1.9))
-    padding = default_padding(camera, water, grid)
-    weights = Weights(grid, padding, factorise(camera, water, grid.padded(padding)), camera.column_axis)
+    weights = Weights.factorised(camera, water, grid)
     view, depths = raw_view(camera, water, 0.025), grid.bounds_mm(2)
     image = np.zeros(camera.rows * camera.columns)
     add_all(view, true, 1.0, image, depths)

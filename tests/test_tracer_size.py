@@ -20,7 +20,6 @@ from lfpiv_cli.particles.search import Task, task_of
 from lfpiv_cli.particles.view import Light, entry_capacity, raw_view, with_radius
 from lfpiv_cli.reconstruction.solvers import normalisers
 from lfpiv_cli.verbs.tracers import Diffusion, TracerSize, size_notices
-from lfpiv_cli.weights.build import default_padding, factorise
 from lfpiv_cli.weights.model import Weights
 from tests.commands import ROOT
 from tests.particle_twin import respond_once
@@ -51,9 +50,7 @@ def tasks_of(
 ) -> list[Task]:
     """Return the tasks that images set whose tracers are taken to be so many microlenses wide."""
     grid = Grid.centred((11, 10, 9), (0.1, 0.1, 0.2), (0.0, 0.0, 1.25))
-    padding = default_padding(camera, media, grid)
-    operator = factorise(camera, media, grid.padded(padding))
-    weights = Weights(grid, padding, operator, camera.column_axis)
+    weights = Weights.factorised(camera, media, grid)
     view, sums = raw_view(camera, media, 0.5 * assumed * LENS_MM, light=waves), normalisers(weights.padded)
     noisy = [rng.poisson(0.5 * image) / 0.5 + rng.normal(0.0, 6.0, image.shape) for image in images]
     return [task_of(image.astype(np.float32), view, weights, camera, sums) for image in noisy]

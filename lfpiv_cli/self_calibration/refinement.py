@@ -29,7 +29,6 @@ from lfpiv_cli.particles.view import Light, View, raw_view, with_radius
 from lfpiv_cli.reconstruction.solvers import normalisers
 from lfpiv_cli.self_calibration.nuisances import MovableScene, NuisanceFit, Nuisances, fit_nuisances
 from lfpiv_cli.self_calibration.walls import Walls, find_walls, refuse_few
-from lfpiv_cli.weights.build import default_padding, factorise
 from lfpiv_cli.weights.model import Weights
 
 # What the images of particles tell of the camera, as figures.
@@ -202,9 +201,7 @@ def refine_calibration(
     told = flow.light
     waves = None if told is None else Light(told.wavelength_mm, told.diffusion_px, grid.bounds_mm(2))
     view = raw_view(camera, media, 0.5 * (given or UNKNOWN_LENSES * scale.lens_mm), calibration, light=waves)
-    padding = default_padding(camera, media, grid)
-    operator = factorise(camera, media, grid.padded(padding))
-    weights = Weights(grid, padding, operator, camera.column_axis, calibration)
+    weights = Weights.factorised(camera, media, grid, calibration)
     sums = normalisers(weights.padded)
 
     def task(image: Singles, seen: View) -> Task:

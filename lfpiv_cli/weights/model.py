@@ -17,6 +17,9 @@ from scipy import ndimage
 from lfpiv_cli.arrays import Floats, Singles
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.names import ColumnAxis
+from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.optics.media import Media
+from lfpiv_cli.weights.build import default_padding, factorise
 from lfpiv_cli.weights.columns import OnDemandOperator
 from lfpiv_cli.weights.operators import Column, WeightsOperator, real_array, voxel_index
 from lfpiv_cli.weights.strips import StripOperator
@@ -48,6 +51,17 @@ class Weights:
     column_axis: ColumnAxis
     calibration: Calibration | None = None
     scene_distortion_per_mm2: Floats | None = None
+
+    @classmethod
+    def factorised(cls, camera: Camera, media: Media, grid: Grid, calibration: Calibration | None = None) -> Weights:
+        """Return weights in factorised form by equivalent ray tracing, padded as far as light spreads.
+
+        Raises
+        ------
+        ConfigError : the array is hexagonal or turned against the sensor, so that its two axes do not separate
+        """
+        padding = default_padding(camera, media, grid)
+        return cls(grid, padding, factorise(camera, media, grid.padded(padding)), camera.column_axis, calibration)
 
     @property
     def shape(self) -> tuple[int, int, int]:
