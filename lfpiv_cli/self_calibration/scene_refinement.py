@@ -42,7 +42,14 @@ from lfpiv_cli.self_calibration.nuisances import (
     moved_places,
     place_changes,
 )
-from lfpiv_cli.self_calibration.refinement import PLANES_APART, REFINING_ROUNDS, camera_figures, first_image, shift_px
+from lfpiv_cli.self_calibration.refinement import (
+    PLANES_APART,
+    REFINING_ROUNDS,
+    STEPS,
+    camera_figures,
+    first_image,
+    shift_px,
+)
 from lfpiv_cli.self_calibration.walls import RING_FROM, RoundWallFit, find_round_wall
 from lfpiv_cli.weights.columns import operator_of
 from lfpiv_cli.weights.model import Weights
@@ -50,9 +57,8 @@ from lfpiv_cli.weights.scene import curved_padding
 
 # Particles are looked for again where the wall has moved by more than this share of its radius, at most so often.
 SETTLED_SHARE, SEARCHES = 0.01, 3
-# Units of progress for the first image, and for each other one.
-STEPS_OF_FIRST = SEARCHES * (sum(settings.iterations + 1 for settings in REFINING_ROUNDS) + 1)
-STEPS_OF_OTHER = sum(settings.iterations + 1 for settings in REFINING_ROUNDS)
+# Units of progress for the first image; the others take `refinement.STEPS`.
+STEPS_OF_FIRST = SEARCHES * (STEPS + 1)
 # The wall is the scene's own once it is found less than this share of the radius, or of a radian, beside it.
 FOUND_SHARE, MOST_STEPS = 1e-5, 8
 # Wall and images agree where the chi-squared of their four differences is below that which chance exceeds in 1e-4.

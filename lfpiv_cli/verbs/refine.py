@@ -26,13 +26,7 @@ from lfpiv_cli.optics.tracing import ObjectSpace
 from lfpiv_cli.reconstruction.images import Image, light
 from lfpiv_cli.self_calibration.refinement import STEPS, ChannelFlow, Refinement
 from lfpiv_cli.self_calibration.refinement import refine_calibration as refine
-from lfpiv_cli.self_calibration.scene_refinement import (
-    AGREEING_CHI2,
-    STEPS_OF_FIRST,
-    STEPS_OF_OTHER,
-    SceneRefinement,
-    refine_scene,
-)
+from lfpiv_cli.self_calibration.scene_refinement import AGREEING_CHI2, STEPS_OF_FIRST, SceneRefinement, refine_scene
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -119,7 +113,7 @@ def _scene(
     settings: Config, scene: CurvedSpace, lit: Sequence[Image], before: Calibration, console: Console
 ) -> SceneRefinement:
     """Return what tracers tell of the place of a scene, from where config and calibration have it."""
-    with console.progress(STEPS_OF_FIRST + (len(lit) - 1) * STEPS_OF_OTHER, "refine") as advance:
+    with console.progress(STEPS_OF_FIRST + (len(lit) - 1) * STEPS, "refine") as advance:
         found = refine_scene(
             lit,
             before,

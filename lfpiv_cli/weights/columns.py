@@ -28,7 +28,7 @@ from lfpiv_cli.optics.tracing import struck_pixel
 from lfpiv_cli.robust import BRIGHTEST_PERCENTILE, LIT_SHARE
 from lfpiv_cli.threads import share_out
 from lfpiv_cli.weights.build import factorise_through, separates, strips_of
-from lfpiv_cli.weights.operators import Column, FactorisedOperator, WeightsOperator
+from lfpiv_cli.weights.operators import Column, FactorisedOperator, WeightsOperator, real_array, voxel_index
 from lfpiv_cli.weights.quadrature import DEPTH_NODES, TILES, Columns, integrate_columns
 from lfpiv_cli.weights.scene import Scene, Source, kernel_scene, lit_voxels, on_array, on_sensor, rays_from
 from lfpiv_cli.weights.strip_blocks import factorise_strips, voxel_centres
@@ -57,7 +57,8 @@ class CompressedOperator(WeightsOperator):
     def parts(self, voxel: Integers) -> Iterator[tuple[Integers, Columns]]:
         """Yield ascending voxels and their columns, part by part: at least those of some that have any."""
 
-    def _image_of(self, volume: Singles) -> Singles:
+    def forward(self, volume: Singles) -> Singles:
+        volume = real_array(volume, self.shape, "a volume")
         light, image = np.ascontiguousarray(volume).ravel(), np.zeros(math.prod(self.image_shape), np.float32)
         for voxel, columns in self.parts(np.flatnonzero(light)):
             images = np.zeros((PARTS, image.size), np.float32)
@@ -65,7 +66,8 @@ class CompressedOperator(WeightsOperator):
             image += images.sum(axis=0)
         return image.reshape(self.image_shape)
 
-    def _volume_of(self, image: Singles) -> Singles:
+    def adjoint(self, image: Singles) -> Singles:
+        image = real_array(image, self.image_shape, "an image")
         pixels, volume = np.ascontiguousarray(image, dtype=np.float32).ravel(), np.zeros(self.shape, np.float32)
         for voxel, columns in self.parts(np.arange(volume.size)):
             values = np.empty(voxel.size, np.float32)
@@ -73,8 +75,8 @@ class CompressedOperator(WeightsOperator):
             volume.ravel()[voxel] = values
         return volume
 
-    def _column_of(self, plane: int, row_voxel: int, column_voxel: int) -> Column:
-        own = np.ravel_multi_index((plane, row_voxel, column_voxel), self.shape)
+    def column(self, plane: int, row_voxel: int, column_voxel: int) -> Column:
+        own = np.ravel_multi_index(voxel_index((plane, row_voxel, column_voxel), self.shape), self.shape)
         voxel, columns = next(self.parts(np.array([own])))
         part = slice(*columns.start[np.searchsorted(voxel, [own, own + 1])])
         row, column = np.divmod(columns.pixel[part].astype(np.int64), self.image_shape[1])

@@ -83,32 +83,21 @@ class WeightsOperator(ABC):
     def image_shape(self) -> tuple[int, int]:
         """Shape (rows, columns) of an image."""
 
+    @abstractmethod
     def forward(self, volume: Singles) -> Singles:
         """Return the image (rows, columns) of a volume [plane, row voxel, column voxel]."""
-        ensure_own_threads()
-        return self._image_of(real_array(volume, self.shape, "a volume"))
 
+    @abstractmethod
     def adjoint(self, image: Singles) -> Singles:
         """Return the volume [plane, row voxel, column voxel] that an image is spread back to."""
-        ensure_own_threads()
-        return self._volume_of(real_array(image, self.image_shape, "an image"))
 
+    @abstractmethod
     def column(self, plane: int, row_voxel: int, column_voxel: int) -> Column:
         """Return the rows, columns (int64) and weights (float32) of the pixels that one voxel lights."""
-        return self._column_of(*voxel_index((plane, row_voxel, column_voxel), self.shape))
 
     @abstractmethod
     def behind(self, transmission: Singles) -> WeightsOperator:
         """Return the weights of pixels that pass a share (rows, columns) of the light."""
-
-    @abstractmethod
-    def _image_of(self, volume: Singles) -> Singles: ...
-
-    @abstractmethod
-    def _volume_of(self, image: Singles) -> Singles: ...
-
-    @abstractmethod
-    def _column_of(self, plane: int, row_voxel: int, column_voxel: int) -> Column: ...
 
 
 class Visits(NamedTuple):
@@ -351,15 +340,20 @@ class FactorisedOperator(SeparatedOperator):
         where = Blocks(first, np.minimum(planes - first, most), np.zeros_like(first))
         return where, BlockShape(most, filled(height, LANES))
 
-    def _image_of(self, volume: Singles) -> Singles:
+    def forward(self, volume: Singles) -> Singles:
+        ensure_own_threads()
+        volume = real_array(volume, self.shape, "a volume")
         _, height, width = self.shape
         return self.project(kernels.turned(volume, (width, filled(height, LANES))))
 
-    def _volume_of(self, image: Singles) -> Singles:
+    def adjoint(self, image: Singles) -> Singles:
+        ensure_own_threads()
+        image = real_array(image, self.image_shape, "an image")
         planes, height, width = self.shape
         return kernels.turned(self.back_project(image, (planes, width, filled(height, LANES))), (height, width))
 
-    def _column_of(self, plane: int, row_voxel: int, column_voxel: int) -> Column:
+    def column(self, plane: int, row_voxel: int, column_voxel: int) -> Column:
+        plane, row_voxel, column_voxel = voxel_index((plane, row_voxel, column_voxel), self.shape)
         row, along_rows = self.rows.row(plane, row_voxel)
         column, along_columns = self.columns.row(plane, column_voxel)
         by_cell = np.outer(along_rows, along_columns) * self.mask[np.ix_(row, column)]
@@ -394,13 +388,13 @@ class BrickOperator(WeightsOperator):
     def behind(self, transmission: Singles) -> BrickOperator:
         return BrickOperator(self.even.behind(transmission), self.odd.behind(transmission))
 
-    def _image_of(self, volume: Singles) -> Singles:
+    def forward(self, volume: Singles) -> Singles:
         return self.even.forward(volume) + self.odd.forward(volume)
 
-    def _volume_of(self, image: Singles) -> Singles:
+    def adjoint(self, image: Singles) -> Singles:
         return self.even.adjoint(image) + self.odd.adjoint(image)
 
-    def _column_of(self, plane: int, row_voxel: int, column_voxel: int) -> Column:
+    def column(self, plane: int, row_voxel: int, column_voxel: int) -> Column:
         both = [each.column(plane, row_voxel, column_voxel) for each in (self.even, self.odd)]
         row, column, weight = (np.concatenate(parts) for parts in zip(*both, strict=True))
         width = self.image_shape[1]

@@ -29,12 +29,12 @@ from lfpiv_cli.arrays import Flags, Floats, Integers, Singles
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.curved_space import CurvedSpace
 from lfpiv_cli.optics.tracing import complete_exponents, polynomial_terms
-from lfpiv_cli.threads import share_out
+from lfpiv_cli.threads import ensure_own_threads, share_out
 from lfpiv_cli.weights import kernels
 from lfpiv_cli.weights.axis import SMALLEST_SHARE, AxisWeights, Bending
 from lfpiv_cli.weights.kernels import PLACES, SLAB, STRIP, Blocks, BlockShape
 from lfpiv_cli.weights.lens_cells import AxisOptics, Cells
-from lfpiv_cli.weights.operators import Column, SeparatedOperator
+from lfpiv_cli.weights.operators import Column, SeparatedOperator, real_array, voxel_index
 from lfpiv_cli.weights.scene import places_on_array
 
 Scalar = TypeVar("Scalar", bound=np.generic)
@@ -85,18 +85,23 @@ class StripOperator(SeparatedOperator):
     def behind(self, transmission: Singles) -> Self:
         return super().behind(np.ascontiguousarray(transmission.T) if self.turned else transmission)
 
-    def _image_of(self, volume: Singles) -> Singles:
+    def forward(self, volume: Singles) -> Singles:
+        ensure_own_threads()
+        volume = real_array(volume, self.shape, "a volume")
         lines = self._as_lines(volume * self.lit)
         image = self.project(kernels.turned(lines, (lines.shape[2], self._height)))
         return np.ascontiguousarray(image.T) if self.turned else image
 
-    def _volume_of(self, image: Singles) -> Singles:
+    def adjoint(self, image: Singles) -> Singles:
+        ensure_own_threads()
+        image = real_array(image, self.image_shape, "an image")
         seen = np.ascontiguousarray(image.T) if self.turned else image
         lines, along = self._as_lines(self.lit).shape[1:]
         volume = self.back_project(seen, (len(self.lit), along, self._height))
         return np.ascontiguousarray(self._as_lines(kernels.turned(volume, (lines, along)))) * self.lit
 
-    def _column_of(self, plane: int, row_voxel: int, column_voxel: int) -> Column:
+    def column(self, plane: int, row_voxel: int, column_voxel: int) -> Column:
+        plane, row_voxel, column_voxel = voxel_index((plane, row_voxel, column_voxel), self.shape)
         image = np.zeros(self.image_shape, np.float32)
         seen = image.T if self.turned else image
         line, along = (column_voxel, row_voxel) if self.turned else (row_voxel, column_voxel)
