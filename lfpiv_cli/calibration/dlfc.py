@@ -239,9 +239,8 @@ def _fit_as_seen_by(
     passed = np.ones((camera.rows, camera.columns), np.float32) if transmission is None else transmission
     if camera.column_axis == "y":
         board = replace(board, dots=board.dots[::-1])
-    boards = aligned(
-        [seen_board(image, z, camera, board, media, passed) for image, z in zip(images, depths, strict=True)], board
-    )
+    seen_boards = [seen_board(image, z, camera, board, media, passed) for image, z in zip(images, depths, strict=True)]
+    boards = aligned(seen_boards, board)
     lines = [np.unique(np.concatenate([each.index[:, axis] for each in boards])).size for axis in (0, 1)]
     degree = min(LARGEST_DEGREE, different - 1, lines[0] - 1, lines[1] - 1)
     if degree < SMALLEST_DEGREE:

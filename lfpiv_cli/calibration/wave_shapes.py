@@ -93,9 +93,8 @@ class WaveShapes:
         """Compute the line responses about depths (n,) that rays tell, some seconds' work."""
         space, beyond = ObjectSpace(medium, refraction="paraxial"), BY_RAYS * camera.scale(medium).depth_mm
         ends = float(depths_mm.min()) - beyond, float(depths_mm.max()) + beyond
-        return cls(
-            camera, medium, on_pixels(line_responses(camera, space, light.wavelength_mm, ends), light.diffusion_px)
-        )
+        lines = line_responses(camera, space, light.wavelength_mm, ends)
+        return cls(camera, medium, on_pixels(lines, light.diffusion_px))
 
     @property
     def lens_mm(self) -> float:

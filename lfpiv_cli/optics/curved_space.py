@@ -60,6 +60,7 @@ MOST_STEPS = 40
 
 Place = tuple[float, float, bool]
 NOWHERE: Place = (np.nan, np.nan, False)
+Met = tuple[float, Vector, Vector, Vector, float, float]
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
@@ -105,26 +106,16 @@ def trace_in(faces: Faces, X: float, Y: float, slope_x: float, slope_y: float, z
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
-def _neighbour(
-    faces: Faces,
-    k: int,
-    shift: Vector,
-    turn: Vector,
-    path: float,
-    place: Vector,
-    direction: Vector,
-    normal: Vector,
-    cosine: float,
-    cosine_behind: float,
-) -> tuple[Vector, Vector]:
+def _neighbour(faces: Faces, k: int, shift: Vector, turn: Vector, ray: Met) -> tuple[Vector, Vector]:
     """Return the first-order shift and turn of a ray beside the one that `meet` and `refracted` took through face k.
 
     Parameters
     ----------
     shift, turn : how its point and direction differ before the face
-    path, place, direction, normal, cosine, cosine_behind : of the ray itself: how far it went to which place on the
-        face, its direction in front of it, and what it met there
+    ray : how far the ray itself went to which place on the face, its direction in front of it, and what it met there:
+        normal and cosines of incidence and refraction
     """
+    path, place, direction, normal, cosine, cosine_behind = ray
     ratio = faces.ratios[k]
     shift = plus(shift, path, turn)
     shift = plus(shift, -dot(normal, shift) / cosine, direction)
@@ -163,12 +154,9 @@ def trace_pencil(
         behind, cosine_behind = refracted(direction, normal, cosine, faces.ratios[k])
         if cosine_behind == 0.0 or behind[2] <= 0.0:
             return point, direction, first, second, False
-        first, first_turn = _neighbour(
-            faces, k, first, first_turn, path, point, direction, normal, cosine, cosine_behind
-        )
-        second, second_turn = _neighbour(
-            faces, k, second, second_turn, path, point, direction, normal, cosine, cosine_behind
-        )
+        ray = path, point, direction, normal, cosine, cosine_behind
+        first, first_turn = _neighbour(faces, k, first, first_turn, ray)
+        second, second_turn = _neighbour(faces, k, second, second_turn, ray)
         direction = behind
     path = (z - point[2]) / direction[2]
     first, second = plus(first, path, first_turn), plus(second, path, second_turn)

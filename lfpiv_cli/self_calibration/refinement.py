@@ -111,11 +111,10 @@ class Refinement:
 
     def applied(self, calibration: Calibration) -> Calibration:
         """Return the calibration with mid plane and lens images where the particles have them."""
+        fit = calibration.fit.shifted(shift_px(self.camera, self.nuisances))
         return replace(
             calibration,
-            rectification=replace(
-                calibration.rectification, fit=calibration.fit.shifted(shift_px(self.camera, self.nuisances))
-            ),
+            rectification=replace(calibration.rectification, fit=fit),
             mid_plane_z_mm=self.walls.middle_mm,
             mid_plane_z_sigma_mm=self.middle_sigma_mm,
             mid_plane_given=False,

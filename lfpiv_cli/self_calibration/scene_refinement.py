@@ -305,12 +305,10 @@ def _following(places_mm: Floats, own_mm: Floats, scene: MovableScene, axis: Flo
     camera = scene.camera
     outer = np.hypot(own_mm[:, 1], own_mm[:, 2]) > np.sqrt(0.5 * (1.0 + RING_FROM**2)) * scene.wall.radius_mm
     places, own, here = places_mm[outer], own_mm[outer], scene.faces(axis)
-    angle = np.arctan2(own[:, 2], own[:, 1])
-    frame = scene.frame(axis)
-    outward = np.cos(angle)[:, np.newaxis] * frame[1] + np.sin(angle)[:, np.newaxis] * frame[2]
-    design = np.stack(
-        [np.cos(angle), np.sin(angle), own[:, 0] * np.cos(angle), own[:, 0] * np.sin(angle), np.ones(len(own))], axis=1
-    )
+    angle, along, frame = np.arctan2(own[:, 2], own[:, 1]), own[:, 0], scene.frame(axis)
+    cosine, sine = np.cos(angle), np.sin(angle)
+    outward = cosine[:, np.newaxis] * frame[1] + sine[:, np.newaxis] * frame[2]
+    design = np.stack([cosine, sine, along * cosine, along * sine, np.ones(len(own))], axis=1)
     follows = np.empty((4, 4))
     for unknown, step in enumerate(SCENE_STEPS):
         change = step * np.eye(4)[unknown]

@@ -151,12 +151,9 @@ def separates(camera: Camera, source: Source, grid: Grid) -> bool:
         off = source.on_array(points, crossings)
         for axis in (0, 1):
             bent = fitted_bending(source, camera, grid, axis)
-            x, crossing = points[:, axis] / bent.scale_mm[0], crossings[:, axis] / bent.scale_mm[1]
-            powers = np.arange(source.degree + 1)
-            terms = (
-                x[:, np.newaxis, np.newaxis] ** powers[:, np.newaxis] * crossing[:, np.newaxis, np.newaxis] ** powers
-            )
-            off[:, axis] -= np.sum(terms * bent.coefficients_mm[planes, 0], axis=(1, 2))
+            own = np.stack([points[:, axis], crossings[:, axis]]) / bent.scale_mm[:, np.newaxis]
+            x, crossing = own[..., np.newaxis] ** np.arange(source.degree + 1)
+            off[:, axis] -= np.einsum("na,nab,nb->n", x, bent.coefficients_mm[planes, 0], crossing)
         return float(np.sqrt(np.mean(off**2))) < LARGEST_COUPLING * float(camera.lattice.pitch.min())
     return not isinstance(source, CurvedSpace) or strips_of(camera, source, grid) is not None
 

@@ -114,9 +114,8 @@ def integrate_columns(
         counts.append(np.bincount(voxel, minlength=last - first))
         first = last
     start = np.concatenate([[0], np.cumsum(np.concatenate([*counts, []]))]).astype(np.int64)
-    return Columns(
-        start, np.concatenate([*pixels, []]).astype(np.int32), np.concatenate([*shares, np.zeros(0, np.float32)])
-    )
+    pixel, share = np.concatenate([*pixels, []]), np.concatenate([*shares, np.zeros(0, np.float32)])
+    return Columns(start, pixel.astype(np.int32), share)
 
 
 @njit(cache=True)

@@ -335,9 +335,8 @@ def spread_mm(camera: Camera, space: CurvedSpace, grid: Grid) -> Floats:
     spread = np.zeros(2)
     for axis in range(2):
         beside = points.copy()
-        beside[:, axis] -= np.copysign(
-            sides[axis], beside[:, axis]
-        )  # towards the optical axis, so not out of the fluid
+        # Towards the optical axis, so not out of the fluid.
+        beside[:, axis] -= np.copysign(sides[axis], beside[:, axis])
         shown, also = places_on_array(camera, space, beside, through_middle)
         for crossing in rim:
             place, passes = places_on_array(camera, space, points, np.broadcast_to(crossing, (len(points), 2)))

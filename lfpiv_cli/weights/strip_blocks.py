@@ -289,7 +289,7 @@ def _factors_along(
     axis, across = scene.along, scene.across
     z, width = scene.centres_mm(2)[planes], scene.grid.spacing_mm[2]
     own, line = scene.centres_mm(axis), scene.centres_mm(across)[lines]
-    side = scene.grid.spacing_mm[scene.world(across)]
+    side, side_along = (scene.grid.spacing_mm[scene.world(each)] for each in (across, axis))
     # Lines within the fluid, where the roots of a polynomial that goes through them best would be.
     nodes = -np.cos(np.pi * (np.arange(LINES_TAKEN) + 0.5) / LINES_TAKEN)
     first, last = lit.argmax(axis=1), lit.shape[1] - 1 - lit[:, ::-1].argmax(axis=1)
@@ -304,9 +304,7 @@ def _factors_along(
     found, misfit = [], 0.0
     for fit in fits_along(scene, rays)[0]:
         bent = fit.bending(depths, taken.ravel())
-        weights = axis_weights(
-            scene.optics[axis], own - rays.middle_mm[axis], scene.grid.spacing_mm[scene.world(axis)], bent
-        )
+        weights = axis_weights(scene.optics[axis], own - rays.middle_mm[axis], side_along, bent)
         factor, off = through_lines(weights, powers, through)
         found.append(factor)
         misfit = max(misfit, float(np.percentile(off[~dark], 90)) if not dark.all() else 0.0)
