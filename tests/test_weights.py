@@ -12,8 +12,8 @@ from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.camera import Camera, Lattice
 from lfpiv_cli.optics.media import Media
 from lfpiv_cli.optics.tracing import ObjectSpace, disc_points, trace
-from lfpiv_cli.weights.build import axis_optics, blur_radius_mm, default_padding, factorise, factorise_through
-from lfpiv_cli.weights.lens_cells import disc_area_below
+from lfpiv_cli.weights.build import blur_radius_mm, default_padding, factorise, factorise_through
+from lfpiv_cli.weights.lens_cells import axis_optics, disc_area_below
 from lfpiv_cli.weights.model import Weights
 from lfpiv_cli.weights.operators import adjoint_reference, forward_reference
 from lfpiv_cli.weights.quadrature import integrate_columns

@@ -52,10 +52,9 @@ from lfpiv_cli.optics.tracing import ObjectSpace
 from lfpiv_cli.reference import Reference
 from lfpiv_cli.simd import COEFFICIENTS
 from lfpiv_cli.weights.axis import AxisWeights
-from lfpiv_cli.weights.build import axis_optics
 from lfpiv_cli.weights.columns import ColumnOperator, OnDemandOperator
 from lfpiv_cli.weights.kernels import SLAB, STRIP, Blocks
-from lfpiv_cli.weights.lens_cells import AxisOptics, aperture_mask, micro_image_cells
+from lfpiv_cli.weights.lens_cells import AxisOptics, aperture_mask, axis_optics, micro_image_cells
 from lfpiv_cli.weights.model import Weights
 from lfpiv_cli.weights.operators import Column, FactorisedOperator, SeparatedOperator, WeightsOperator
 from lfpiv_cli.weights.quadrature import Columns

@@ -36,7 +36,7 @@ from lfpiv_cli.tracks.candidates import Seen
 from lfpiv_cli.tracks.tracking import track
 from lfpiv_cli.validation.planning import cramer_rao_bound, expected_image, pixel_variance, slopes
 from lfpiv_cli.validation.volume import Matches, fit_errors, match, pairs_of, particle_figures
-from lfpiv_cli.weights.build import default_padding, factorise, factorise_through
+from lfpiv_cli.weights.build import default_padding, factorise_through
 from lfpiv_cli.weights.model import Weights
 
 # Axes: (x, y, z) in mm, z away from the camera from where the channel's mid plane is (or is believed to be).
@@ -152,10 +152,8 @@ class Case:
 
     @cached_property
     def _weights(self) -> Weights:
-        camera, media = self.believed.camera, self.believed.media
-        grid = self.believed.grid(self.size_mm, self.voxel_mm)
-        padding = default_padding(camera, media, grid)
-        return Weights(grid, padding, factorise(camera, media, grid.padded(padding)), camera.column_axis)
+        rig = self.believed
+        return Weights.factorised(rig.camera, rig.media, rig.grid(self.size_mm, self.voxel_mm))
 
     def particles(self, image: Image) -> Points:
         """Return the places (n, 3) of the particles behind an image, those a little outside the box as well."""

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from lfpiv_cli.arrays import Floats, Singles
+from lfpiv_cli.calibration.board_pose import lens_in_scene_mm
 from lfpiv_cli.calibration.model import Calibration, known
 from lfpiv_cli.calibration.wave_shapes import WaveLight
 from lfpiv_cli.grid import Grid
@@ -216,8 +217,6 @@ def refine_calibration(
     known = np.isfinite(variance) & (variance > 0.0)
     behind_walls = view._replace(layers=space.layers(camera))
     position, sigma = places_by_snell(position[known], behind_walls), np.sqrt(variance[known])
-    lens = float(camera.lattice.pitch.max()) / abs(camera.magnification)
-    lens_depth = lens / camera.aperture_radius_mm * camera.focus_distance_mm / media.depth_ratio
     return Refinement(
         walls=find_walls(position, sigma, grid.bounds_mm(2), flow.width_mm, len(images)),
         nuisances=fit.found,
@@ -227,7 +226,7 @@ def refine_calibration(
         frames=len(images),
         expected_z_mm=calibration.mid_plane_z_mm,
         expected_sigma_mm=calibration.mid_plane_z_sigma_mm,
-        common_depth_mm=COMMON_SHARE_OF_LENS_DEPTH * lens_depth,
+        common_depth_mm=COMMON_SHARE_OF_LENS_DEPTH * (lens_in_scene_mm(camera)[1] / media.depth_ratio),
         width_mm=flow.width_mm,
         particle_diameter_mm=2.0 * view.particle_radius_mm,
         camera=camera,

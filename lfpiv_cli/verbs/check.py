@@ -41,7 +41,8 @@ from lfpiv_cli.verbs.planning import (
     rig_lines,
     seeding_line,
 )
-from lfpiv_cli.weights.build import aligned, default_padding
+from lfpiv_cli.weights.build import default_padding
+from lfpiv_cli.weights.lens_cells import aligned
 
 # What images tell of an experiment before anything is made of them: a verdict a line.
 #

@@ -22,10 +22,11 @@ from lfpiv_cli.optics import tracing
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.curved_space import CurvedSpace
 from lfpiv_cli.optics.media import Media
-from lfpiv_cli.weights.build import separates, strips_of
+from lfpiv_cli.weights.build import separates
 from lfpiv_cli.weights.columns import LARGEST_BYTES
 from lfpiv_cli.weights.quadrature import RayCount
 from lfpiv_cli.weights.scene import Source, seen_depths_mm
+from lfpiv_cli.weights.strip_blocks import strips_of
 
 # Whether weights can be right: the data sheet beside itself, the calibration and the angles, before any work.
 

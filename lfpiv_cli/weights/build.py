@@ -19,13 +19,11 @@ from lfpiv_cli.optics.curved_space import CurvedSpace
 from lfpiv_cli.optics.media import Media, equivalent_object_distance
 from lfpiv_cli.optics.tracing import ObjectSpace, PolynomialRays, disc_points
 from lfpiv_cli.weights.axis import Bending, axis_weights, depth_nodes
-from lfpiv_cli.weights.lens_cells import AxisOptics, Optics, aperture_mask
+from lfpiv_cli.weights.lens_cells import Optics, aligned, aperture_mask, axis_optics
 from lfpiv_cli.weights.operators import BrickOperator, FactorisedOperator
 from lfpiv_cli.weights.scene import Source
-from lfpiv_cli.weights.strip_blocks import StripLayout, strip_layout
+from lfpiv_cli.weights.strip_blocks import strips_of
 
-# A lattice counts as aligned with the sensor when over its whole width it strays by less than a hundredth of a pixel.
-ALIGNED_PX = 0.01
 # Straight pieces of the bent ray's place on the array over X, a cubic: with eight they are off by 0.2 % of a lens pitch
 # in the paper's simulation.
 STRIPS = 8
@@ -156,42 +154,6 @@ def separates(camera: Camera, source: Source, grid: Grid) -> bool:
             off[:, axis] -= np.einsum("na,nab,nb->n", x, bent.coefficients_mm[planes, 0], crossing)
         return float(np.sqrt(np.mean(off**2))) < LARGEST_COUPLING * float(camera.lattice.pitch.min())
     return not isinstance(source, CurvedSpace) or strips_of(camera, source, grid) is not None
-
-
-def strips_of(camera: Camera, space: CurvedSpace, grid: Grid) -> StripLayout | None:
-    """Return the strips of a volume within which array and rays separate into two axes; None where they do in none."""
-    return strip_layout(camera, space, grid, axis_optics(camera)) if aligned(camera) else None
-
-
-def aligned(camera: Camera) -> bool:
-    """Return whether the array is square and stands upright on the sensor."""
-    basis = camera.lattice.basis
-    stray_px = np.abs([basis[1, 0], basis[0, 1]]) / camera.lattice.pitch[::-1] * [camera.rows, camera.columns]
-    return camera.lattice.layout == "square" and bool(stray_px.max() <= ALIGNED_PX)
-
-
-def axis_optics(camera: Camera, widths_mm: tuple[float, float] | None = None) -> Optics:
-    """Return the camera's two axes, (columns, rows); the widths of the lenses are their pitches if not given."""
-    basis = camera.lattice.basis
-    pixels = np.array([camera.columns, camera.rows])
-    if not aligned(camera):
-        raise ConfigError(
-            f"camera.microlenses: a {camera.lattice.layout} array turned by "
-            f"{np.degrees(camera.lattice.rotation_rad):z.4f} degrees against the sensor does not separate into columns "
-            "and rows; a square one aligned with it is needed (a calibration aligns it)"
-        )
-    widths = widths_mm or (float(basis[0, 0]), float(basis[1, 1]))
-    first, second = (
-        AxisOptics(
-            camera=camera.for_kernels(),
-            lens_origin_mm=float(camera.lattice.origin[axis]),
-            lens_pitch_mm=float(basis[axis, axis]),
-            lens_width_mm=widths[axis],
-            pixels=int(pixels[axis]),
-        )
-        for axis in (0, 1)
-    )
-    return first, second
 
 
 def scene_distortion(camera: Camera, media: Media, grid: Grid) -> Floats | None:

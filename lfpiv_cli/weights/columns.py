@@ -27,11 +27,11 @@ from lfpiv_cli.optics.curved_space import CurvedSpace
 from lfpiv_cli.optics.tracing import struck_pixel
 from lfpiv_cli.robust import BRIGHTEST_PERCENTILE, LIT_SHARE
 from lfpiv_cli.threads import share_out
-from lfpiv_cli.weights.build import factorise_through, separates, strips_of
+from lfpiv_cli.weights.build import factorise_through, separates
 from lfpiv_cli.weights.operators import Column, FactorisedOperator, WeightsOperator, real_array, voxel_index
 from lfpiv_cli.weights.quadrature import DEPTH_NODES, TILES, Columns, integrate_columns
 from lfpiv_cli.weights.scene import Scene, Source, kernel_scene, lit_voxels, on_array, on_sensor, rays_from
-from lfpiv_cli.weights.strip_blocks import factorise_strips, voxel_centres
+from lfpiv_cli.weights.strip_blocks import factorise_strips, strips_of, voxel_centres
 from lfpiv_cli.weights.strips import StripOperator
 
 # Columns may take this much memory: two thirds of a machine with 24 GiB, the rest is for volumes and images.

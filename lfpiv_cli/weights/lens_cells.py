@@ -12,7 +12,8 @@ from numba import njit
 from numpy.typing import NDArray
 
 from lfpiv_cli.arrays import Floats, Integers, Singles
-from lfpiv_cli.optics.camera import KernelCamera, Lattice
+from lfpiv_cli.errors import ConfigError
+from lfpiv_cli.optics.camera import Camera, KernelCamera, Lattice
 from lfpiv_cli.threads import share_out
 
 # The cells of one axis: where its lenses and its pixels meet.
@@ -46,6 +47,41 @@ class AxisOptics(NamedTuple):
 
 # Along the columns, and along the rows.
 Optics = tuple[AxisOptics, AxisOptics]
+
+
+# A lattice counts as aligned with the sensor when over its whole width it strays by less than a hundredth of a pixel.
+ALIGNED_PX = 0.01
+
+
+def aligned(camera: Camera) -> bool:
+    """Return whether the array is square and stands upright on the sensor."""
+    basis = camera.lattice.basis
+    stray_px = np.abs([basis[1, 0], basis[0, 1]]) / camera.lattice.pitch[::-1] * [camera.rows, camera.columns]
+    return camera.lattice.layout == "square" and bool(stray_px.max() <= ALIGNED_PX)
+
+
+def axis_optics(camera: Camera, widths_mm: tuple[float, float] | None = None) -> Optics:
+    """Return the camera's two axes, (columns, rows); the widths of the lenses are their pitches if not given."""
+    basis = camera.lattice.basis
+    pixels = np.array([camera.columns, camera.rows])
+    if not aligned(camera):
+        raise ConfigError(
+            f"camera.microlenses: a {camera.lattice.layout} array turned by "
+            f"{np.degrees(camera.lattice.rotation_rad):z.4f} degrees against the sensor does not separate into columns "
+            "and rows; a square one aligned with it is needed (a calibration aligns it)"
+        )
+    widths = widths_mm or (float(basis[0, 0]), float(basis[1, 1]))
+    first, second = (
+        AxisOptics(
+            camera=camera.for_kernels(),
+            lens_origin_mm=float(camera.lattice.origin[axis]),
+            lens_pitch_mm=float(basis[axis, axis]),
+            lens_width_mm=widths[axis],
+            pixels=int(pixels[axis]),
+        )
+        for axis in (0, 1)
+    )
+    return first, second
 
 
 class Cells(NamedTuple):

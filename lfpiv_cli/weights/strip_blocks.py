@@ -23,7 +23,7 @@ from lfpiv_cli.optics.curved_space import CurvedSpace
 from lfpiv_cli.simd import GROUP, TILE
 from lfpiv_cli.weights.axis import axis_weights, depth_nodes
 from lfpiv_cli.weights.kernels import PLACES, SLAB, STRIP, Blocks
-from lfpiv_cli.weights.lens_cells import Cells, Optics, aperture_mask, micro_image_cells
+from lfpiv_cli.weights.lens_cells import Cells, Optics, aligned, aperture_mask, axis_optics, micro_image_cells
 from lfpiv_cli.weights.quadrature import integrate_columns
 from lfpiv_cli.weights.scene import lit_voxels, places_on_array
 from lfpiv_cli.weights.strips import (
@@ -365,9 +365,11 @@ class StripLayout(NamedTuple):
         return -(-self.scene.lit.shape[1] // STRIP)
 
 
-def strip_layout(camera: Camera, space: CurvedSpace, grid: Grid, optics: Optics) -> StripLayout | None:
+def strips_of(camera: Camera, space: CurvedSpace, grid: Grid) -> StripLayout | None:
     """Return strips of rows of voxels or of columns, what needs fewer parts; None where rays separate in neither."""
-    lit = lit_voxels(camera, space, grid)
+    if not aligned(camera):
+        return None
+    lit, optics = lit_voxels(camera, space, grid), axis_optics(camera)
     scenes = [strip_scene(camera, space, grid, optics, lit, turned) for turned in (False, True)]
     judged = [(scene, *_judged(scene)) for scene in scenes]
     found = [StripLayout(scene, parts) for scene, off, parts in judged if off < LARGEST_STRAY_LEFT]
