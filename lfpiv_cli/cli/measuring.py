@@ -25,15 +25,22 @@ from lfpiv_cli.cli.options import (
     mask_option,
     output_option,
     pairing_options,
+    parsed_by,
     raw_option,
     watch_options,
     white_option,
     work_options,
 )
-from lfpiv_cli.console import Console
 from lfpiv_cli.errors import UsageError
 from lfpiv_cli.names import Divergence, GridMethod, Kept, RunMethod, Start, Weighting, names_in
 from lfpiv_cli.reconstruction.registry import SOLVER_NAMES
+
+
+def particles_in(folder: Path) -> tuple[Path, ...]:
+    """Return the files of particles in a folder."""
+    from lfpiv_cli.files.listing import expanded
+
+    return tuple(expanded([folder], "results"))
 
 
 @click.command("field")
@@ -52,18 +59,13 @@ from lfpiv_cli.reconstruction.registry import SOLVER_NAMES
 @click.option(
     "--pressure",
     type=FILE,
+    callback=parsed_by(particles_in),
     help="Folder of the particles of all frames of a sequence: the pressure is found by its tracks' accelerations.",
 )
 @output_option("File of vectors to write (.vtkhdf).")
 @common_options
-def field(
-    samples: tuple[Path, ...],
-    output: Path,
-    overwrite: bool,
-    console: Console,
-    pressure: Path | None = None,
-    **chosen: Any,
-) -> dict[str, Any]:
+@calls("field.fit_flow", "FieldOptions", "samples", "output")
+def field() -> None:
     """Fit one velocity field to tracks and vectors of a flow, each weighed by its error.
 
     The field is smooth and, in a liquid, free of divergence as far as the data ask for; where no track is near, the
@@ -74,13 +76,6 @@ def field(
              lfpiv field tracks.vtkhdf vectors.vtkhdf --derived -o field.vtkhdf
              lfpiv field run/tracks.vtkhdf --pressure run/particles -o field.vtkhdf
     """
-    from lfpiv_cli.files.listing import expanded
-    from lfpiv_cli.verbs import field as stage
-
-    particles = [] if pressure is None else expanded([pressure], "results")
-    return stage.fit_flow(
-        samples, output, stage.FieldOptions(pressure=particles, **chosen), overwrite=overwrite, console=console
-    )
 
 
 @click.command("track")
@@ -167,26 +162,27 @@ def follow() -> None:
     """
 
 
-def parse_windows(
-    _context: click.Context, _parameter: click.Parameter, text: str | None
-) -> tuple[int | tuple[int, ...], ...] | None:
+def parse_windows(text: str) -> tuple[int | tuple[int, ...], ...]:
     """Return windows given as 32,16 or 32x32x16,16x16x8."""
-    return None if text is None else tuple(_window(part) for part in text.split(","))
-
-
-def _window(text: str) -> int | tuple[int, ...]:
-    try:
-        sizes = tuple(int(part) for part in text.lower().split("x"))
-    except ValueError as error:
-        raise UsageError(f"--windows: {text!r} is neither a number of voxels nor three of them as 32x32x16") from error
-    return sizes[0] if len(sizes) == 1 else sizes
+    windows: list[int | tuple[int, ...]] = []
+    for part in text.split(","):
+        try:
+            sizes = tuple(int(size) for size in part.lower().split("x"))
+        except ValueError as error:
+            raise UsageError(
+                f"--windows: {part!r} is neither a number of voxels nor three of them as 32x32x16"
+            ) from error
+        windows.append(sizes[0] if len(sizes) == 1 else sizes)
+    return tuple(windows)
 
 
 @click.command("correlate")
 @inputs_argument("volumes", "results")
 @click.option("--config", type=FILE, help="In place of the config carried by the volumes.")
 @dt_option
-@click.option("--windows", callback=parse_windows, help="Interrogation windows in voxels, coarse to fine, as 32,16.")
+@click.option(
+    "--windows", callback=parsed_by(parse_windows), help="Interrogation windows in voxels, coarse to fine, as 32,16."
+)
 @click.option("--overlap", type=click.FloatRange(min=0.0, max=1.0, max_open=True), help="Of neighbouring windows.")
 @click.option(
     "--weighting", type=click.Choice(names_in(Weighting)), help="How voxels count by their place in a window."

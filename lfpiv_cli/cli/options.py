@@ -137,29 +137,9 @@ def inputs_argument(name: str, kind: InputKind = "images") -> Callable[..., Any]
     return with_inputs
 
 
-def parsed_by(parse: Callable[[str], Any]) -> Callable[[click.Context, click.Parameter, str | None], Any]:
+def parsed_by(parse: Callable[[Any], Any]) -> Callable[[click.Context, click.Parameter, Any], Any]:
     """Return the callback of an option whose text is parsed by a function, if it is given."""
     return lambda _context, _option, text: None if text is None else parse(text)
-
-
-shard_option = click.option(
-    "--shard",
-    metavar="I/N|slurm",
-    callback=parsed_by(Shard.parse),
-    help="Make part I of N only, or that of this job in Slurm's array.",
-)
-time_limit_option = click.option(
-    "--time-limit",
-    "time_limit_s",
-    metavar="TIME",
-    callback=parsed_by(parse_time_limit),
-    help="Stop before so long, as 3600, 50m or 00:50:00, with exit code 75; --resume goes on.",
-)
-dask_option = click.option(
-    "--dask",
-    metavar="ADDRESS|local[:N]",
-    help="Work on the workers of this Dask scheduler, or on N workers on this machine.",
-)
 
 
 def watch_options(command: Callable[..., Any]) -> Callable[..., Any]:
@@ -202,25 +182,30 @@ def raw_option(command: Callable[..., Any]) -> Callable[..., Any]:
     return run
 
 
-keep_going_option = click.option(
-    "--keep-going", is_flag=True, help="Go on with the next one when an input fails; exit 5."
-)
-failures_option = click.option("--failures", type=FILE, help="File to list what failed in, with the reason (JSON).")
-
-
 def work_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """Give a command the options of all that goes through many frames."""
-    dry_run = click.option(
-        "--dry-run",
-        is_flag=True,
-        help="Tell what would be made, how large and, by the --log of an earlier run, in which time; write nothing.",
-    )
     for option in (
-        dry_run,
-        time_limit_option,
-        shard_option,
-        failures_option,
-        keep_going_option,
+        click.option(
+            "--dry-run",
+            is_flag=True,
+            help="Tell what would be made, how large and, by the --log of an earlier run, in which time; "
+            "write nothing.",
+        ),
+        click.option(
+            "--time-limit",
+            "time_limit_s",
+            metavar="TIME",
+            callback=parsed_by(parse_time_limit),
+            help="Stop before so long, as 3600, 50m or 00:50:00, with exit code 75; --resume goes on.",
+        ),
+        click.option(
+            "--shard",
+            metavar="I/N|slurm",
+            callback=parsed_by(Shard.parse),
+            help="Make part I of N only, or that of this job in Slurm's array.",
+        ),
+        click.option("--failures", type=FILE, help="File to list what failed in, with the reason (JSON)."),
+        click.option("--keep-going", is_flag=True, help="Go on with the next one when an input fails; exit 5."),
         resume_option,
     ):
         command = option(command)
@@ -229,7 +214,8 @@ def work_options(command: Callable[..., Any]) -> Callable[..., Any]:
 
 def batch_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """Give a command the options of all batches, whose outputs workers elsewhere can make, too."""
-    return work_options(dask_option(command))
+    help_text = "Work on the workers of this Dask scheduler, or on N workers on this machine."
+    return work_options(click.option("--dask", metavar="ADDRESS|local[:N]", help=help_text)(command))
 
 
 def pairing_options(command: Callable[..., Any]) -> Callable[..., Any]:

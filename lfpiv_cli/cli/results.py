@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from importlib import import_module
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, Literal, cast
 
 import click
 
@@ -91,42 +91,25 @@ def validate(
              lfpiv validate paper --quick -o report    (the paper's tables and figures on one page; takes no CONFIG)
     """
     chosen = {name: value for name, value in chosen.items() if value not in (False, ())}
-    _refuse_misplaced(what, chosen)
-    if what == "paper":
-        return _validate_paper(config, output, overwrite, console, **chosen)
-    if config is None:
-        raise click.UsageError(f"validate {what} needs a CONFIG")
-    module = "validate_board" if what == "board" else "validate"
-    stage = getattr(import_module(f"lfpiv_cli.verbs.{module}"), f"validate_{what}")
-    return cast(dict[str, Any], stage(config, output, overwrite=overwrite, console=console, **chosen))
-
-
-def _validate_paper(
-    config: Path | None,
-    output: Path,
-    overwrite: bool,
-    console: Console,
-    quick: bool = False,
-    only: tuple[PaperPart, ...] = (),
-    resume: bool = False,
-) -> dict[str, Any]:
-    """Make the report on the paper."""
-    from lfpiv_cli.paper.run import PaperOptions, validate_paper
-
-    if config is not None:
-        raise click.UsageError(f"validate paper takes no CONFIG, got {config}")
-    options = PaperOptions(only=only, size="quick" if quick else "full", resume=resume)
-    return validate_paper(output, options, overwrite=overwrite, console=console)
-
-
-def _refuse_misplaced(what: str, chosen: dict[str, Any]) -> None:
-    """Raise where an option is given that a validation does not take, or missing that it needs."""
     misplaced = [f"--{name}" for name in chosen if name not in TAKEN[what]]
     if misplaced:
         raise click.UsageError(f"validate {what} takes no {' and no '.join(misplaced)}")
     missing = [f"--{name}" for name in NEEDED.get(what, ()) if name not in chosen]
     if missing:
         raise click.UsageError(f"validate {what} needs {' and '.join(missing)}")
+    common: dict[str, Any] = {"overwrite": overwrite, "console": console}
+    if what == "paper":
+        from lfpiv_cli.paper.run import PaperOptions, validate_paper
+
+        if config is not None:
+            raise click.UsageError(f"validate paper takes no CONFIG, got {config}")
+        size: Literal["quick", "full"] = "quick" if chosen.pop("quick", False) else "full"
+        return validate_paper(output, PaperOptions(size=size, **chosen), **common)
+    if config is None:
+        raise click.UsageError(f"validate {what} needs a CONFIG")
+    module = "validate_board" if what == "board" else "validate"
+    stage = getattr(import_module(f"lfpiv_cli.verbs.{module}"), f"validate_{what}")
+    return cast(dict[str, Any], stage(config, output, **common, **chosen))
 
 
 @click.command("report")

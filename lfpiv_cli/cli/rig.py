@@ -180,51 +180,43 @@ def _asked() -> RigNumbers:
 
     plain = RigNumbers()
     answers: dict[str, Any] = {
-        "magnification": _magnification(plain.magnification),
+        "magnification": _asked_for(
+            "magnification, image over object, negative because the image is inverted", plain.magnification, _inverted
+        ),
         "focal_length_mm": _length("focal length of the main lens, mm", plain.focal_length_mm),
         "pitch_mm": (pitch := _length("pitch of the microlenses, mm", plain.pitch_mm)),
     }
     guess = RigNumbers(**answers).complete()
-    focal = _length_or_f_number(
-        "focal length of the microlenses, mm, or their f-number as f/8", f"{guess.microlens_focal_length_mm:g}"
+    focal = _asked_for(
+        "focal length of the microlenses, mm, or their f-number as f/8",
+        f"{guess.microlens_focal_length_mm:g}",
+        _length_or_f_number,
     )
     answers["microlens_focal_length_mm"] = focal[0] or focal[1] * pitch
     guess = RigNumbers(**answers).complete()
-    aperture = _length_or_f_number("f-number of the main lens as f/4, or its aperture, mm", f"f/{guess.f_number:g}")
+    text = "f-number of the main lens as f/4, or its aperture, mm"
+    aperture = _asked_for(text, f"f/{guess.f_number:g}", _length_or_f_number)
     answers["f_number"] = aperture[1] or answers["focal_length_mm"] / aperture[0]
     answers |= {
         "pixel_um": _length("size of the pixels, um", plain.pixel_um, "um"),
-        "columns": _count("columns of the images", plain.columns),
-        "rows": _count("rows of the images", plain.rows),
+        "columns": click.prompt("columns of the images", plain.columns, type=click.IntRange(min=1), err=True),
+        "rows": click.prompt("rows of the images", plain.rows, type=click.IntRange(min=1), err=True),
         "fluid": (fluid := _asked_for("refractive index of the fluid", plain.fluid, _above_zero)),
     }
     if fluid != 1.0:
         answers["wall"] = _asked_for("refractive index of the wall or window", plain.wall, _above_zero)
-        answers["wall_mm"] = _length_or_none("its thickness, mm", plain.wall_mm)
-        width = _length_or_none("inner width of the channel along the optical axis, mm, 0 without one", 0.0)
-        answers["channel_mm"] = width or None
+        answers["wall_mm"] = _length("its thickness, mm", plain.wall_mm, may_be_0=True)
+        text = "inner width of the channel along the optical axis, mm, 0 without one"
+        answers["channel_mm"] = _length(text, 0.0, may_be_0=True) or None
     guess = RigNumbers(**answers).complete()
-    answers["size_mm"] = _sides("size of the volume, mm", guess.size_mm or (1.0, 1.0, 1.0))
+    sides = " ".join(f"{side:g}" for side in guess.size_mm or (1.0, 1.0, 1.0))
+    answers["size_mm"] = _asked_for("size of the volume, mm", sides, _sides)
     answers["velocity_m_s"] = _asked_for(
         "velocity to expect, m/s", plain.velocity_m_s, lambda answer: _in_unit(answer.removesuffix("/s"), "m")
     )
-    wavelength = _length_or_none(
-        "wavelength of the light, nm, 0 for rays, with which no camera's images agree", 532.0, "nm"
-    )
-    answers["wavelength_nm"] = wavelength or None
+    text = "wavelength of the light, nm, 0 for rays, with which no camera's images agree"
+    answers["wavelength_nm"] = _length(text, 532.0, "nm", may_be_0=True) or None
     return RigNumbers(**answers)
-
-
-def _magnification(default: float) -> float:
-    """Ask for the magnification; images are inverted, whether the answer has its minus or not, and that is said."""
-
-    def parsed(answer: str) -> float:
-        value = -_above_zero(answer.removeprefix("-"))
-        if not answer.startswith("-"):
-            click.echo(f"magnification: taken as {value:g}, because the image is inverted", err=True)
-        return value
-
-    return _asked_for("magnification, image over object, negative because the image is inverted", default, parsed)
 
 
 def _asked_for(text: str, default: float | str, parse: Callable[[str], Answer]) -> Answer:
@@ -233,44 +225,38 @@ def _asked_for(text: str, default: float | str, parse: Callable[[str], Answer]) 
     return click.prompt(text, shown, value_proc=lambda answer: parse(answer.strip()), err=True)
 
 
-def _length(text: str, default: float, unit: str = "mm") -> float:
-    return _asked_for(text, default, lambda answer: _in_unit(answer, unit))
+def _length(text: str, default: float, unit: str = "mm", may_be_0: bool = False) -> float:
+    """Ask for a length."""
+    return _asked_for(
+        text, default, lambda answer: 0.0 if may_be_0 and _split_unit(answer)[0] == "0" else _in_unit(answer, unit)
+    )
 
 
-def _length_or_none(text: str, default: float, unit: str = "mm") -> float:
-    """Ask for a length that may be 0."""
-    return _asked_for(text, default, lambda answer: 0.0 if _split_unit(answer)[0] == "0" else _in_unit(answer, unit))
+def _inverted(answer: str) -> float:
+    """Return a magnification; images are inverted, whether the answer has its minus or not, and that is said."""
+    value = -_above_zero(answer.removeprefix("-"))
+    if not answer.startswith("-"):
+        click.echo(f"magnification: taken as {value:g}, because the image is inverted", err=True)
+    return value
 
 
-def _count(text: str, default: int) -> int:
-    return int(click.prompt(text, default, type=click.IntRange(min=1), err=True))
+def _length_or_f_number(answer: str) -> tuple[float, float]:
+    """Return a length or an f-number; the other one of the two is 0."""
+    word = answer.lower()
+    return (0.0, _above_zero(word.removeprefix("f/"))) if word.startswith("f/") else (_in_unit(word, "mm"), 0.0)
 
 
-def _length_or_f_number(text: str, default: str) -> tuple[float, float]:
-    """Ask for a length or an f-number; the other one of the two is 0."""
-
-    def parsed(answer: str) -> tuple[float, float]:
-        word = answer.lower()
-        return (0.0, _above_zero(word.removeprefix("f/"))) if word.startswith("f/") else (_in_unit(word, "mm"), 0.0)
-
-    return _asked_for(text, default, parsed)
-
-
-def _sides(text: str, default: tuple[float, float, float]) -> tuple[float, float, float]:
-    """Ask for three lengths; a unit behind the last one alone is that of all."""
-
-    def parsed(answer: str) -> tuple[float, float, float]:
-        apart = re.sub(r"[,x×]", " ", answer)
-        words = re.sub(rf"\s+(?=({'|'.join(UNITS_MM)})\b)", "", apart).split()
-        units = [_split_unit(word)[1] for word in words]
-        if len(words) == 3 and not any(units[:2]):
-            words = [f"{_split_unit(word)[0]}{units[2]}" for word in words]
-        if len(words) != 3:
-            raise click.UsageError(f"{answer}: expected three lengths, x y z")
-        x, y, z = (_in_unit(word, "mm") for word in words)
-        return x, y, z
-
-    return _asked_for(text, " ".join(f"{side:g}" for side in default), parsed)
+def _sides(answer: str) -> tuple[float, float, float]:
+    """Return three lengths; a unit behind the last one alone is that of all."""
+    apart = re.sub(r"[,x×]", " ", answer)
+    words = re.sub(rf"\s+(?=({'|'.join(UNITS_MM)})\b)", "", apart).split()
+    units = [_split_unit(word)[1] for word in words]
+    if len(words) == 3 and not any(units[:2]):
+        words = [f"{_split_unit(word)[0]}{units[2]}" for word in words]
+    if len(words) != 3:
+        raise click.UsageError(f"{answer}: expected three lengths, x y z")
+    x, y, z = (_in_unit(word, "mm") for word in words)
+    return x, y, z
 
 
 def _split_unit(word: str) -> tuple[str, str]:

@@ -367,36 +367,35 @@ def dry_run(batch: Batch[Any], options: WorkOptions, console: Console) -> dict[s
             console.answer(f"would make {batch.targets[number].path}")
     for number, fault in faults.items():
         console.answer(f"would leave out {batch.names[number]}: {fault}")
-    told: dict[str, Any] = {
-        f"{batch.unit}s": len(share),
-        "to_make": len(making),
-        "skipped": len(skipped),
-        "unreadable": len(faults) + len(batch.left_out),
-    }
-    expected = batch.expected() if making else Expected()
-    folder = next(path for path in batch.targets[0].path.absolute().parents if path.exists())
     known = [sum(path.stat().st_size for path in batch.targets[number].paths) for number in skipped]
-    each, known_by = median(known) if known else None, "those that are there"
-    if each is None and expected.file_bytes is not None:
-        each, known_by = expected.file_bytes + RECORD_BYTES, AT_MOST
-    told |= {
-        "disk_mb": None if each is None else len(making) * each / MB,
-        "disk_by": None if each is None else known_by,
-        "disk_free_mb": shutil.disk_usage(folder).free / MB,
-    }
-    told |= time_and_memory(batch.label, len(making), expected, console)
+    counts = {"to_make": len(making), "skipped": len(skipped), "unreadable": len(faults) + len(batch.left_out)}
+    expected = batch.expected() if making else Expected()
+    told: dict[str, Any] = {f"{batch.unit}s": len(share)}
+    told |= estimate(batch.label, counts, known, expected, batch.targets[0].path, console)
     if console.only_warnings:
         told["would_make"] = [str(batch.targets[number].path) for number in making]
     return told
 
 
-def time_and_memory(label: str, count: int, expected: Expected, console: Console) -> dict[str, float | str | None]:
-    """Return how long so many outputs take and how much memory: by the log, memory without one by the arrays held."""
+def estimate(
+    label: str, counts: dict[str, int], known: Sequence[int], expected: Expected, place: Path, console: Console
+) -> dict[str, Any]:
+    """Return the `counts` of outputs, and what those that are to be made take: disk, time and memory.
+
+    The size of an output is the median of those that are known, time and memory are by the log of an earlier run.
+    """
+    count, each, known_by = counts["to_make"], median(known) if known else None, "those that are there"
+    if each is None and expected.file_bytes is not None:
+        each, known_by = expected.file_bytes + RECORD_BYTES, AT_MOST
+    folder = next(path for path in (place.absolute(), *place.absolute().parents) if path.is_dir())
     last = None if console.log is None else console.log.last("frame", step=label)
     logged, held = last or {}, expected.memory_bytes
     seconds, memory = logged.get("seconds_each"), logged.get("memory_mb")
     by_log = f"the last run in {console.log_file}"
-    return {
+    return counts | {
+        "disk_mb": None if each is None else count * each / MB,
+        "disk_by": None if each is None else known_by,
+        "disk_free_mb": shutil.disk_usage(folder).free / MB,
         "seconds": None if seconds is None else count * seconds,
         "seconds_by": None if seconds is None else by_log,
         "memory_mb": memory if memory is not None or held is None else (PROGRAM_BYTES + held) / MB,

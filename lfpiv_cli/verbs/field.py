@@ -73,7 +73,7 @@ def pressure_of(
     InputError
         The particles are not those of the trajectories, or too few tracks pass five frames.
     """
-    density, viscosity = settings.fluid_density_kg_m3(), settings.fluid_viscosity_pa_s()
+    settings.fluid_density_kg_m3(), settings.fluid_viscosity_pa_s()  # before any work
     number = len(particles) // 2 if frame is None else frame
     if not 0 <= number < len(particles):
         raise UsageError(f"frame {number} is none of {len(particles)}, which are counted from 0")
@@ -91,22 +91,10 @@ def pressure_of(
     sigma = trajectories.arrays["velocity_sigma"][row] * dt_s / MM_TO_M
     moving = Samples(motion.position_mm, motion.velocity, sigma[:, :, np.newaxis] ** 2 * np.eye(3), sure)
     low, high = motion.position_mm.min(axis=0), motion.position_mm.max(axis=0)
-    # mm^2/s times s per frame times mm per frame per mm^2
-    friction = viscosity / density * MM2_PER_M2 * dt_s * pressure.laplacian_at(
-        fit_field(moving, low, high), motion.position_mm
-    )  # fmt: skip
-    to_m_s2 = MM_TO_M / dt_s**2
-    neglected = neglected_share(motion)
-    samples = pressure.pressure_gradients(
-        motion.position_mm, to_m_s2 * (motion.acceleration - friction), to_m_s2**2 * motion.covariance, density, sure
-    )
-    figures = {
-        "frame": number,
-        "tracks": len(tracks),
-        "acceleration_rms_m_s2": (to_m_s2 * _rms(motion.acceleration)).tolist(),
-        "friction_share": float(np.linalg.norm(friction) / np.linalg.norm(motion.acceleration)),
-        "neglected_share": neglected,
-    }
+    flow, neglected = fit_field(moving, low, high), neglected_share(motion)
+    accelerated = motion.position_mm, motion.acceleration, motion.covariance, sure
+    samples, told = _gradients(flow, *accelerated, settings, dt_s)
+    figures = {"frame": number, "tracks": len(tracks), **told, "neglected_share": neglected}
     return _on_windows(samples, settings, pressure.knots_for(samples.points_mm), neglected, figures)
 
 
@@ -120,18 +108,34 @@ def pressure_of_steady_flow(field: Field, dt_s: float, settings: Config) -> Pres
     UsageError
         The field is not of splines, whose gradients alone have known errors.
     """
-    density, viscosity = settings.fluid_density_kg_m3(), settings.fluid_viscosity_pa_s()
+    settings.fluid_density_kg_m3(), settings.fluid_viscosity_pa_s()  # before any work
     if not isinstance(field, SplineField):
         raise UsageError("the pressure of a steady flow needs a field of splines")
-    points, acceleration, covariance = pressure.steady_accelerations(field)
-    friction = viscosity / density * MM2_PER_M2 * dt_s * pressure.laplacian_at(field, points)
+    samples, figures = _gradients(field, *pressure.steady_accelerations(field), None, settings, dt_s)
+    return _on_windows(samples, settings, max(field.lattice.cell_mm), 0.0, figures)
+
+
+def _gradients(
+    flow: Field,
+    points_mm: Floats,
+    acceleration: Floats,
+    covariance: Floats,
+    sure: Floats | None,
+    settings: Config,
+    dt_s: float,
+) -> tuple[Samples, dict[str, Any]]:
+    """Return the gradients of the pressure at points of a flow, by accelerations in mm per frame^2; and figures."""
+    density, viscosity = settings.fluid_density_kg_m3(), settings.fluid_viscosity_pa_s()
+    # mm^2/s times s per frame times mm per frame per mm^2
+    friction = viscosity / density * MM2_PER_M2 * dt_s * pressure.laplacian_at(flow, points_mm)
     to_m_s2 = MM_TO_M / dt_s**2
-    samples = pressure.pressure_gradients(points, to_m_s2 * (acceleration - friction), to_m_s2**2 * covariance, density)
-    figures = {
-        "acceleration_rms_m_s2": (to_m_s2 * _rms(acceleration)).tolist(),
+    samples = pressure.pressure_gradients(
+        points_mm, to_m_s2 * (acceleration - friction), to_m_s2**2 * covariance, density, sure
+    )
+    return samples, {
+        "acceleration_rms_m_s2": (to_m_s2 * np.sqrt(np.mean(acceleration**2, axis=0))).tolist(),
         "friction_share": float(np.linalg.norm(friction) / np.linalg.norm(acceleration)),
     }
-    return _on_windows(samples, settings, max(field.lattice.cell_mm), 0.0, figures)
 
 
 def trajectories_from(points: Points, counts: Sequence[int]) -> Trajectories:
@@ -167,10 +171,6 @@ def link_probability(trajectories: Points) -> Floats:
 def neglected_share(motion: Motion) -> float:
     """Return how much of the accelerations is wrong alike among neighbours."""
     return float(np.linalg.norm(motion.neglected) / np.linalg.norm(motion.acceleration))
-
-
-def _rms(vectors: Floats) -> Floats:
-    return np.asarray(np.sqrt(np.mean(vectors**2, axis=0)))
 
 
 def _on_windows(

@@ -21,7 +21,6 @@ from lfpiv_cli.files.particle_file import Points, symmetric
 from lfpiv_cli.files.provenance import record
 from lfpiv_cli.files.sections import NM_TO_MM
 from lfpiv_cli.files.weights_file import WeightsFile, open_weights
-from lfpiv_cli.grid import Grid
 from lfpiv_cli.notice import Notice, warn_of
 from lfpiv_cli.optics.curved_space import CurvedSpace
 from lfpiv_cli.optics.line_responses import USUAL_DIFFUSION_PX
@@ -194,21 +193,18 @@ def _size_of(
     found: Diameter | None, given: float | None, given_px: float | None, lens_mm: float, by_waves: bool
 ) -> TracerSize:
     """Return the tracers' size, as given or by what images show of it, by waves with diffusion."""
-    diffusion = _diffusion(found, given_px) if by_waves else None
+    diffusion = None
+    if by_waves:
+        # As given, by the images, or as is usual.
+        shown = None if found is None else found.held if given_px is None else found.shown
+        usual = USUAL_DIFFUSION_PX if shown is None else shown.diffusion_px
+        diffusion = Diffusion(usual if given_px is None else given_px, given=given_px is not None)
+        if shown is not None:
+            diffusion = replace(diffusion, measured_px=shown.diffusion_px, sigma_px=shown.sigma_px, told=shown.told)
     if found is None:
         return TracerSize(given or UNKNOWN_LENSES * lens_mm, diffusion=diffusion)
     measured = lens_mm * found.lenses
     return TracerSize(given or measured, measured, lens_mm * found.sigma_lenses, found.resolved, diffusion)
-
-
-def _diffusion(found: Diameter | None, given_px: float | None) -> Diffusion:
-    """Return the sensor's charge diffusion: as given, by the images, or as is usual."""
-    given = given_px is not None
-    shown = None if found is None else found.shown if given else found.held
-    px = given_px if given_px is not None else USUAL_DIFFUSION_PX if shown is None else shown.diffusion_px
-    if shown is None:
-        return Diffusion(px, given=given)
-    return Diffusion(px, shown.diffusion_px, shown.sigma_px, given, shown.told)
 
 
 def find(bench: Bench, frame: Frame, progress: Callable[[int], None] | None = None) -> Particles:
@@ -284,7 +280,11 @@ def points_of(bench: Bench, frame: Frame, found: Particles, size: TracerSize, pr
     """Return the particles found behind an image in the coordinates of files, by Snell's law where it is known."""
     content = bench.content
     space = _space(content, bench.settings)
-    outside = _outside(found.position_mm, content.weights.grid)
+    bounds = np.array([content.weights.grid.bounds_mm(axis) for axis in range(3)])
+    inside = np.all((found.position_mm >= bounds[:, 0]) & (found.position_mm <= bounds[:, 1]), axis=1)
+    # How many microlenses the volume fills as the scene shows them.
+    camera, (width, height, _) = content.camera, np.diff(bounds)[:, 0]
+    lenses = float(width * height) * camera.magnification**2 / camera.lattice.cell_area
     left = what_is_left(frame, found)
     norm = float(np.linalg.norm(np.where(frame.unusable, 0.0, frame.image)))
     share_left = float(np.linalg.norm(left)) / norm if norm > 0.0 else 0.0
@@ -299,7 +299,8 @@ def points_of(bench: Bench, frame: Frame, found: Particles, size: TracerSize, pr
             "covariance_mm2": symmetric(found.covariance_mm2),
             "chi2": found.chi2,
             "seen": found.seen,
-            "flag": outside,
+            # Those outside the volume are kept because they light it.
+            "flag": (~inside).astype(np.uint8),
         },
         content.reference,
         attributes=content.reference.attributes()
@@ -310,7 +311,7 @@ def points_of(bench: Bench, frame: Frame, found: Particles, size: TracerSize, pr
             "residual_rms_counts": float(np.sqrt(np.mean(left[~frame.unusable] ** 2))),
             "excluded_pixels": int(np.count_nonzero(frame.unusable)),
             "read_noise_counts": found.noise.read_counts,
-            "particles_per_lens": float(np.count_nonzero(outside == 0)) / _lenses_before(bench),
+            "particles_per_lens": float(np.count_nonzero(inside)) / lenses,
         }
         | ({} if number is None else {"tracers_per_lens": number})
         | ({} if focus is None else {"microlens_focus": focus.off, "microlens_focus_sigma": focus.sigma})
@@ -356,20 +357,6 @@ def tracers_per_lens(bench: Bench, frame: Frame) -> float | None:
     return counted(task_for(replace(bench, settings=settings), frame), bench.lens_images.lattice_px)
 
 
-def _lenses_before(bench: Bench) -> float:
-    """Return how many microlenses the volume fills as the scene shows them."""
-    camera, grid = bench.content.camera, bench.content.weights.grid
-    (low_x, high_x), (low_y, high_y) = (grid.bounds_mm(axis) for axis in (0, 1))
-    return (high_x - low_x) * (high_y - low_y) * camera.magnification**2 / camera.lattice.cell_area
-
-
-def _outside(position_mm: NDArray[np.float64], grid: Grid) -> NDArray[np.uint8]:
-    """Return 1 for particles outside the volume, kept because they light it, 0 for those inside."""
-    bounds = np.array([grid.bounds_mm(axis) for axis in range(3)])
-    inside = np.all((position_mm >= bounds[:, 0]) & (position_mm <= bounds[:, 1]), axis=1)
-    return (~inside).astype(np.uint8)
-
-
 class Finder:
     """Finds the particles of frames, alone or with the first passes of those beside them.
 
@@ -408,11 +395,12 @@ class Finder:
             return find(self._bench, frame, advance), []
         notices, helping = [], []
         for k in self._beside[number]:
-            fault = self._fault(k) if self._keep_going else None
-            if fault is None:
+            try:
+                if self._keep_going:
+                    self._frame(k)
                 helping.append(k)
-            else:
-                text = f"is found without the help of {self._frames[k].stem}: {fault}"
+            except InputError as error:
+                text = f"is found without the help of {self._frames[k].stem}: {error}"
                 notices.append(Notice("frame-alone", self._frames[number].stem, text, "mend that one"))
         if not helping:
             return find(self._bench, frame, advance), notices
@@ -430,14 +418,6 @@ class Finder:
         raw, lit = self._read(number)
         check_frame(self._bench, raw, str(self._frames[number].path))
         return frame_of(self._bench, raw, lit)
-
-    def _fault(self, number: int) -> str | None:
-        """Return why a frame cannot help another one, None where it can."""
-        try:
-            self._frame(number)
-        except InputError as error:
-            return str(error)
-        return None
 
 
 class Prepared:

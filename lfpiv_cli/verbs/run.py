@@ -14,7 +14,6 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import math
-import shutil
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -36,7 +35,7 @@ from lfpiv_cli.files.provenance import Gone, carried_record, sha256, without_war
 from lfpiv_cli.names import FlowMethod
 from lfpiv_cli.notice import written
 from lfpiv_cli.verbs import build_weights, calibrate, particles
-from lfpiv_cli.verbs.batches import ALL, AT_MOST, MB, RECORD_BYTES, Expected, Worked, dry_run, time_and_memory
+from lfpiv_cli.verbs.batches import ALL, MB, Expected, Worked, dry_run, estimate
 from lfpiv_cli.verbs.build_weights import plan_of
 from lfpiv_cli.verbs.calibrate import ensure_pictures
 from lfpiv_cli.verbs.checks import figures_of
@@ -315,7 +314,7 @@ def planned(chain: Chain) -> dict[str, Any]:
             size = field_bytes(settings, settings.grid()) if method == "volumes" else None
             batch = chain.in_pairs(method, found, size)
             told[RESULTS[method]] = dry_run(batch, chain.batch_options(shared=True), console)
-    return counts | {"method": " and ".join(methods)} | _together(told, output)
+    return counts | {"method": " and ".join(methods)} | _together(told)
 
 
 def with_overwrite(chain: Chain) -> str:
@@ -382,32 +381,26 @@ def _from_nothing(chain: Chain) -> dict[str, Any]:
             dropped = options.keep == "results" and chain.pairs.separate | (method == "volumes")
             if dropped and folder == method:
                 continue  # the files of a pair at a time
-            disk = None if size is None else count * (size + RECORD_BYTES) / MB
-            told[folder] = {
-                "to_make": count,
-                "skipped": 0,
-                "unreadable": given - count,
-                "disk_mb": disk,
-                "disk_by": None if disk is None else AT_MOST,
-            } | time_and_memory("reconstruct" if dropped else label, count, Expected(size, held), console)
+            made_by, numbers = "reconstruct" if dropped else label, {"to_make": count, "skipped": 0}
+            numbers["unreadable"] = given - count
+            told[folder] = estimate(made_by, numbers, (), Expected(size, held), chain.steps.output, console)
     told_method = f"{asked}, reckoned as volumes" if asked == "auto" else asked
     built = {"weights_mb": None if cost is None else cost.weights_bytes / MB}
-    return {"method": told_method} | built | _together(told, chain.steps.output)
+    return {"method": told_method} | built | _together(told)
 
 
-def _together(told: Mapping[str, Mapping[str, Any]], output: Path) -> dict[str, Any]:
+def _together(told: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
     """Return what several batches tell: the counts of each, the sums of disk and time, the most of memory."""
     working = [each for each in told.values() if each["to_make"]]
-    there = next(path for path in (output.absolute(), *output.absolute().parents) if path.exists())
     figures: dict[str, Any] = {
         key: {name: each[key] for name, each in told.items()} for key in ("to_make", "skipped", "unreadable")
     }
-    for key, name in (("disk_mb", "disk"), ("seconds", "seconds")):
+    for key, by in (("disk_mb", "disk_by"), ("seconds", "seconds_by")):
         # A sum is known where all its parts are.
         known = [each[key] for each in working]
-        figures |= {key: None if None in known else sum(known), f"{name}_by": _words(f"{name}_by", working)}
-        if name == "disk":
-            figures["disk_free_mb"] = shutil.disk_usage(there).free / MB
+        figures |= {key: None if None in known else sum(known), by: _words(by, working)}
+        if key == "disk_mb":
+            figures["disk_free_mb"] = next(iter(told.values()))["disk_free_mb"]
     memory = [each["memory_mb"] for each in working if each["memory_mb"] is not None]
     figures |= {"memory_mb": max(memory, default=None), "memory_by": _words("memory_by", working)}
     listed = [path for each in told.values() for path in each.get("would_make", ())]

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +22,7 @@ from lfpiv_cli.files.provenance import record
 from lfpiv_cli.files.sections_simulated import FlowSection
 from lfpiv_cli.flow.field import VectorField
 from lfpiv_cli.flow.windows import RoundWall
-from lfpiv_cli.names import Moment
+from lfpiv_cli.names import FlowMethod, Moment
 from lfpiv_cli.notice import Notice
 from lfpiv_cli.optics.curved_space import CurvedSpace
 from lfpiv_cli.optics.tracing import ObjectSpace
@@ -32,12 +31,9 @@ from lfpiv_cli.validation import methods as of_methods
 from lfpiv_cli.validation import weights as of_weights
 from lfpiv_cli.validation.flow import Duct, Measured, limits_missed, truth_at_points
 from lfpiv_cli.validation.volume import volume_figures
-from lfpiv_cli.verbs.build_weights import BuildWeightsOptions, build_weights_file
-from lfpiv_cli.verbs.calibrate import CalibrateOptions, calibrate_snapshot
-from lfpiv_cli.verbs.correlate import correlate_files
-from lfpiv_cli.verbs.reconstruct import ReconstructOptions, reconstruct_files
+from lfpiv_cli.verbs.run import run
+from lfpiv_cli.verbs.run_steps import RunOptions
 from lfpiv_cli.verbs.simulate import board_at, board_depths, ensure_experiment, frame_names, simulate_images
-from lfpiv_cli.verbs.track import TrackOptions, track_particles
 from lfpiv_cli.verbs.validate_board import depths_in_volume, validate_board
 
 if TYPE_CHECKING:
@@ -203,7 +199,11 @@ def validate_flow(
     if pipe is not None and walls is not None:
         fields = {name: measured.field for name, measured in methods.items()}
         write_picture(paths[RADII], of_methods.radius_figure(fields, walls, pipe.mean_velocity_m_s), overwrite)
-    summary = _summary(figures) if is_simulated else _scalars(figures["measured"])
+    # The figures that are numbers; of a simulation each with the value of every method.
+    first = next(iter(figures.values()))
+    summary: dict[str, Any] = {name: value for name, value in first.items() if not isinstance(value, (list, dict))}
+    if is_simulated:
+        summary = {name: {method: found[name] for method, found in figures.items()} for name in summary}
     summary["truth"] = truth
     if len(methods) > 1:
         summary["lower_error"] = report["lower_error"]
@@ -215,30 +215,22 @@ def validate_flow(
 def measure_images(
     config: Path, images: Path, output: Path, *, overwrite: bool = False, console: Console = CONSOLE
 ) -> dict[str, Path]:
-    """Measure the flow in images that `simulate_images` made, calibration included; return the vectors by method."""
-    settings, dark = load_config(config), images / "dark.tif"
-    common: dict[str, Any] = {"overwrite": overwrite, "console": console}
-    calibration, weights = output / "calibration.h5", output / "weights.h5"
-    depths = board_depths(settings) if settings.weights.method == "dlfc" else []
-    boards = [images / board_at(depth) for depth in depths] or [images / "board.tif"]
-    pictures = CalibrateOptions(white=[images / "white.tif"], dark=dark, board=boards, depth_mm=depths)
-    calibrate_snapshot(config, calibration, pictures, **common)
-    build_weights_file(config, weights, BuildWeightsOptions(calibration=calibration), **common)
-    pair = [images / name for name in frame_names(settings.simulation.frames)[:2]]
-    vectors: dict[str, Path] = {}
-    for method in settings.flow_methods():
-        options = ReconstructOptions(dark=dark)
-        if method == "particles":
-            options = replace(options, solver="particles", pairing="ab")
-        reconstruct_files(weights, pair, output / method, options, **common)
-        found = [output / method / f"{image.stem}.vtkhdf" for image in pair]
-        if method == "volumes":
-            vectors[method] = output / "vectors.vtkhdf"
-            correlate_files(found, vectors[method], **common)
-        else:
-            vectors[method] = output / "tracks_grid.vtkhdf"
-            track_particles(found, output / "tracks.vtkhdf", TrackOptions(grid=True), **common)
-    return vectors
+    """Measure the flow in images that `simulate_images` made, as `run` does; return the vectors by method."""
+    settings = load_config(config)
+    methods = cast(tuple[FlowMethod, ...], settings.flow_methods())
+    depths = board_depths(settings) if settings.weights.method == "dlfc" else ()
+    recorded = RunOptions(
+        images=[images / name for name in frame_names(settings.simulation.frames)[:2]],
+        white=[images / "white.tif"],
+        dark=images / "dark.tif",
+        board=[images / board_at(depth) for depth in depths] or [images / "board.tif"],
+        depth_mm=depths,
+        method="both" if len(methods) > 1 else methods[0],
+        report=False,
+    )
+    run(config, output, recorded, overwrite=overwrite, console=console)
+    names: dict[FlowMethod, str] = {"volumes": "vectors", "particles": "tracks_grid"}
+    return {method: output / f"{names[method]}.vtkhdf" for method in methods}
 
 
 def duct_of(flow: FlowSection | None) -> Duct | None:
@@ -285,16 +277,6 @@ def light_notices(settings: Config) -> list[Notice]:
     text = f"images are simulated {made}, and tracers are fitted {fitted}: particles err more than with the same light"
     remedy = "reconstruction.wavelength_nm as simulation.light has it, or neither"
     return [Notice("light-differs", "simulation.light", text, remedy)]
-
-
-def _scalars(figures: Mapping[str, Any]) -> dict[str, Any]:
-    return {name: value for name, value in figures.items() if not isinstance(value, (list, dict))}
-
-
-def _summary(figures: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
-    """Return the figures that are numbers, each with the value of every method."""
-    names = _scalars(next(iter(figures.values())))
-    return {name: {method: found[name] for method, found in figures.items()} for name in names}
 
 
 def _truth_of_particles(path: Path, centres_mm: Floats) -> tuple[Floats, NDArray[np.bool_]]:
