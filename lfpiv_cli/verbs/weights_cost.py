@@ -24,9 +24,10 @@ from lfpiv_cli.optics.curved_space import CurvedSpace
 from lfpiv_cli.optics.media import Media
 from lfpiv_cli.weights.build import separates
 from lfpiv_cli.weights.columns import LARGEST_BYTES
+from lfpiv_cli.weights.kernels import SLAB, STRIP
 from lfpiv_cli.weights.quadrature import RayCount
 from lfpiv_cli.weights.scene import Source, seen_depths_mm
-from lfpiv_cli.weights.strip_blocks import strips_of
+from lfpiv_cli.weights.strip_blocks import PARTS_JUDGED, strips_of
 
 # Whether weights can be right: the data sheet beside itself, the calibration and the angles, before any work.
 
@@ -111,11 +112,14 @@ def _na(camera: Camera) -> float:
 
 # Measured on one core. A voxel's factors along an axis have 2 to 2.6 entries for each pixel of a lens image; they take
 # 8 bytes and 1.2 us each, the aperture's mask 0.3 us a pixel of the sensor. A projection makes 5e9 multiplications a
-# second, one for each entry along the rows and pixel along the columns; those of strips take half as long again. A
-# column takes some 8 ms and 1,500 pixels of 8 bytes, behind curved faces 13 ms. A core counts some four million rays a
+# second, one for each entry along the rows and pixel along the columns; those of strips take half as long again. Behind
+# curved faces fitting the rays of a strip's block takes .45 s and its entries half as long as others; that blocks will
+# do is judged by a few of them, in both directions, before the work is estimated and again before it is done. A column
+# takes some 8 ms and 1,500 pixels of 8 bytes, behind curved faces 13 ms. A core counts some four million rays a
 # second.
 ENTRIES_PER_PIXEL = 2.5
 ENTRY_BYTES, ENTRY_S, MASK_PIXEL_S = 8, 1.2e-6, 3e-7
+BLOCK_S, BLOCK_ENTRY_S, JUDGED_S, TIMES_JUDGED = 0.45, 6e-7, 0.28, 4
 MULTIPLICATIONS_PER_S = 5e9
 COLUMN_S, COLUMN_BYTES = 8e-3, 12_000
 RAYS_PER_CORE_HOUR = 1.5e10
@@ -172,6 +176,10 @@ def cost_of(settings: Config, camera: Camera, source: Source, grid: Grid) -> Cos
     both_axes, pixel_bytes = planes * (strips * columns + rows) * entries, FLOAT_BYTES * pixels
     products = planes * rows * entries * (columns + camera.columns)
     weights_bytes, weights_s = both_axes * ENTRY_BYTES + pixel_bytes, both_axes * ENTRY_S + pixels * MASK_PIXEL_S
+    if isinstance(source, CurvedSpace):
+        blocks = (-(-planes // SLAB), -(-rows // STRIP))
+        judged = TIMES_JUDGED * math.prod(map(min, blocks, PARTS_JUDGED[::-1]))
+        weights_s += both_axes * (BLOCK_ENTRY_S - ENTRY_S) + BLOCK_S * math.prod(blocks) + JUDGED_S * judged
     image_bytes, image_s = held + both_axes * ENTRY_BYTES + pixel_bytes, projections * products / MULTIPLICATIONS_PER_S
     return Cost(voxels, weights_bytes, weights_s, image_bytes, image_s)
 
