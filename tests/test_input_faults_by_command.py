@@ -240,6 +240,13 @@ def virtual(file: h5py.File, other: Path) -> None:
     file.create_virtual_dataset("extra", layout)
 
 
+def secret(other: Path) -> str:
+    """Write a file that somebody else's data is in; return its name."""
+    with h5py.File(other.with_name("secret.h5"), "w") as file:
+        file["array"] = np.full((4, 24), 7.0)
+    return str(other.with_name("secret.h5"))
+
+
 def grown(group: h5py.Group) -> None:
     """Add groups ten deep, each with ten names for the next one: a path has ten billion ends."""
     for _ in range(10):
@@ -256,6 +263,12 @@ HOSTILE: dict[str, Callable[[h5py.File, Path], object]] = {
     "virtual": virtual,
     "external link": lambda file, other: file.__setitem__("extra", h5py.ExternalLink(str(other), "/array")),
     "soft link": lambda file, other: file.__setitem__("extra", h5py.SoftLink("/none")),
+    "soft link to what is there": lambda file, other: file.__setitem__("extra", h5py.SoftLink("/" + next(iter(file)))),
+    "external link to data": lambda file, other: file.__setitem__("extra", h5py.ExternalLink(secret(other), "/array")),
+    "external storage of data": lambda file, other: file.create_dataset(
+        "extra", (9,), "f8", external=[(secret(other), 0, h5py.h5f.UNLIMITED)]
+    ),
+    "virtual of data": lambda file, other: virtual(file, Path(secret(other))),
     "strings": lambda file, other: file.create_dataset("extra", (3,), h5py.string_dtype()),
     "compound": lambda file, other: file.create_dataset("extra", (3,), [("a", "f8"), ("b", "i4")]),
     "complex": lambda file, other: file.create_dataset("extra", data=np.array([1j])),
