@@ -97,7 +97,7 @@ def test_pages_are_pairs_within_their_file_and_results_by_these(tmp_path: Path) 
     ]
     found = image_pairs(frames, AB)
     assert found.pairs == ((0, 1), (2, 3), (4, 5))
-    assert [each.name for each in found.left_out] == ["r2.tif, page 2"]
+    assert [each.about for each in found.left_out] == ["r2.tif, page 2"]
     # Page 1 is a second frame, whatever is left of the others.
     assert image_pairs(frames[1:3], AB).pairs == ()
     assert image_pairs(frames[:3], PairOptions(pairing="sequence")).pairs == ((0, 1), (1, 2))
@@ -105,7 +105,7 @@ def test_pages_are_pairs_within_their_file_and_results_by_these(tmp_path: Path) 
     left = [result(tmp_path, f"run_{page:04d}", "run.tif", page) for page in (0, 1, 2, 4, 5)]
     found = result_pairs(left, AB)
     assert found.pairs == ((0, 1), (3, 4))
-    assert [each.name for each in found.left_out] == [str(left[2])]
+    assert [each.about for each in found.left_out] == [str(left[2])]
     # Each the first page of its file, as the second could not be read.
     first = [result(tmp_path, f"run{k}_0000", f"run{k}.tif") for k in (1, 2)]
     assert result_pairs(first, AB).pairs == ()
@@ -124,8 +124,8 @@ def test_images_pair_results_whatever_their_names_but_once(tmp_path: Path) -> No
     paths += [result(tmp_path, f"{k}b", f"{k}b.tif") for k in (1, 2)]
     found = result_pairs(paths, AB)
     assert found.pairs == ((0, 2),)
-    assert [each.name for each in found.left_out] == [str(paths[1]), str(paths[3])]
-    assert "same image" in found.left_out[0].why
+    assert [each.about for each in found.left_out] == [str(paths[1]), str(paths[3])]
+    assert "same image" in found.left_out[0].text
     # Images of one name leave it to the results names.
     paths = [result(tmp_path, f"1{letter}", "image.tif", digest=letter) for letter in "ba"]
     broken = tmp_path / "2a.vtkhdf"

@@ -10,8 +10,7 @@ from pathlib import PurePath
 import pytest
 
 from lfpiv_cli.errors import InputError, UsageError
-from lfpiv_cli.files.frame_names import places_by
-from lfpiv_cli.files.pairing import Pairs, Seen, contradiction, in_order, pair_frames
+from lfpiv_cli.files.pairing import Pairs, Seen, contradiction, in_order, pair_frames, places_by
 from lfpiv_cli.names import Pairing
 
 # What a camera calls the frames of pair `k`, first and second.
@@ -127,7 +126,7 @@ def test_two_lost_frames_do_not_turn_the_others_round() -> None:
     left = [name for name in names if name not in ("b2", "a7")]
     found = pair_names(left, "ab")
     assert named(left, found) == {(f"a{k}", f"b{k}") for k in (1, 3, 4, 5, 6, 8, 9, 10)}
-    assert [(each.name, each.why) for each in found.left_out] == [
+    assert [(each.about, each.text) for each in found.left_out] == [
         ("a2", "the second frame of its pair is missing"),
         ("b7", "the first frame of its pair is missing"),
     ]
@@ -140,7 +139,7 @@ def test_a_lost_running_number_leaves_the_pairs_around_it() -> None:
     left = [f"run_{n:03d}" for n in (0, 1, 2, 4, 5)]
     found = pair_names(left, "ab")
     assert named(left, found) == {("run_000", "run_001"), ("run_004", "run_005")}
-    assert [each.name for each in found.left_out] == ["run_002"]
+    assert [each.about for each in found.left_out] == ["run_002"]
 
 
 def test_where_pairs_begin_is_open_with_a_gap_and_without_a_zero() -> None:
@@ -203,8 +202,8 @@ def test_pages_apart_contradict_that_they_are_a_pair() -> None:
 def test_a_repeated_frame_is_left_out_with_its_pair() -> None:
     found = pair_names(["x/1a", "x/1b", "y/1a", "x/2a", "x/2b"], "ab")
     assert found.pairs == ((3, 4),)
-    assert [each.name for each in found.left_out] == ["x/1a", "y/1a", "x/1b"]
-    assert "twice: x/1a and y/1a" in found.left_out[0].why
+    assert [each.about for each in found.left_out] == ["x/1a", "y/1a", "x/1b"]
+    assert "twice: x/1a and y/1a" in found.left_out[0].text
 
 
 def test_series_of_one_command_stay_apart() -> None:
@@ -212,7 +211,7 @@ def test_series_of_one_command_stay_apart() -> None:
     # As ab, hot and cold could be the two frames.
     found = pair_names(names, "ab")
     assert not found.pairs
-    assert "2 series" in found.left_out[0].why
+    assert "2 series" in found.left_out[0].text
     assert named(names, pair_names(names, "sequence")) == {("hot_1", "hot_2"), ("cold_1", "cold_2")}
 
 
@@ -231,7 +230,7 @@ def test_a_sequence_has_no_pair_across_a_gap() -> None:
     names = ["t_9", "t_10", "t_12", "t_13"]
     found = pair_names(names, "sequence")
     assert found.pairs == ((0, 1), (2, 3))
-    assert [(each.name, each.why) for each in found.left_out] == [("t_12", "frames are missing between t_10 and it")]
+    assert [(each.about, each.text) for each in found.left_out] == [("t_12", "frames are missing between t_10 and it")]
     letters = ["1a", "1b", "2b", "3a"]
     assert named(letters, pair_names(letters, "sequence")) == {("1a", "1b"), ("2b", "3a")}
 
@@ -252,7 +251,7 @@ def test_order_alone_pairs_names_that_tell_nothing() -> None:
     with pytest.raises(InputError, match="early"):
         pair_names(["still", "moved", "early"], "ab").settled(keep_going=False)
     mixed = pair_names(["1a", "1b", "background"], "ab")
-    assert [each.name for each in mixed.left_out] == ["background"]
+    assert [each.about for each in mixed.left_out] == ["background"]
 
 
 @pytest.mark.parametrize(
@@ -280,7 +279,7 @@ def test_a_pair_has_two_frames() -> None:
     with pytest.raises(UsageError, match="x, y, z"):
         places_by("{pair}_{frame}", ["1_x", "1_y", "1_z"])
     found = pair_names(["1_a", "1_b", "2_a", "other"], "ab", "{pair}_{frame}")
-    assert [each.name for each in found.left_out] == ["other", "2_a"]
+    assert [each.about for each in found.left_out] == ["other", "2_a"]
 
 
 def test_one_frame_is_no_pair() -> None:

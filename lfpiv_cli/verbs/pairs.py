@@ -106,7 +106,7 @@ class PairBatch(Batch[Made], ABC, Generic[Made, Chosen]):
 
 def failures_of(pairs: Pairs) -> list[Failure]:
     """Return the frames that have no partner, as what has failed."""
-    return [Failure(each.name, each.why) for each in pairs.left_out]
+    return [Failure(each.about, each.text) for each in pairs.left_out]
 
 
 def image_pairs(frames: Sequence[Frame], options: PairOptions) -> Pairs:
@@ -181,7 +181,7 @@ def watched(folders: Sequence[Path], kind: InputKind, options: BatchOptions, con
     def read(path: Path) -> None:
         if kind == "images":
             # The others are there when the last one is.
-            image_files.read_page(path, image_files.count_pages(path) - 1)
+            image_files.read_image(path, image_files.count_pages(path) - 1)
         else:
             vtkhdf.read_header(path)
 
@@ -262,8 +262,8 @@ def coming_pairs(
         # Once: what is taken for granted, and files that have no partner though later pairs are complete.
         last = max((second for _, second in made), default=0)
         before = {str(path) for path in seen[:last]}
-        passed = Pairs((), tuple(each for each in found.left_out if each.name in before), found.notices)
-        unsaid = [notice for notice in passed.said() if notice not in told]
+        passed = [*found.notices, *(each for each in found.left_out if each.about in before)]
+        unsaid = [notice for notice in passed if notice not in told]
         told.update(unsaid)
         console.warn(unsaid)
         if fresh:
