@@ -33,8 +33,8 @@ import yaml
 
 from lfpiv_cli.errors import LfpivError
 from lfpiv_cli.files.config import load_config
-from lfpiv_cli.files.hdf5_checks import DIGEST, write_digest
-from lfpiv_cli.files.images import count_pages, read_page
+from lfpiv_cli.files.hdf5 import DIGEST, write_digest
+from lfpiv_cli.files.images import count_pages, read_image
 from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, UNITS, Points, read_points, write_points
 from lfpiv_cli.files.vtkhdf import open_volume, write_volume
 from lfpiv_cli.files.weights_file import open_weights
@@ -281,7 +281,7 @@ def read_config(path: Path) -> object:
 
 def read_frames(path: Path) -> object:
     """Read all frames of a file."""
-    return [read_page(path, page).tobytes() for page in range(count_pages(path))]
+    return [read_image(path, page).tobytes() for page in range(count_pages(path))]
 
 
 def read_results(path: Path) -> object:

@@ -43,46 +43,30 @@ from typing import TYPE_CHECKING, Any
 from lfpiv_cli.files.kernel_cache import ensure_place
 
 if TYPE_CHECKING:
-    from lfpiv_cli.errors import LfpivError
-    from lfpiv_cli.files.vtkhdf import open_vectors, open_volume
-    from lfpiv_cli.files.weights_file import open_weights
-    from lfpiv_cli.flow.combining import combine
-    from lfpiv_cli.notice import LfpivWarning
-    from lfpiv_cli.verbs.build_weights import build_weights
-    from lfpiv_cli.verbs.calibrate import calibrate
-    from lfpiv_cli.verbs.correlate import correlate
-    from lfpiv_cli.verbs.fields import fit_field
-    from lfpiv_cli.verbs.following import follow
-    from lfpiv_cli.verbs.particles import find_particles
-    from lfpiv_cli.verbs.readers import load_rig, open_calibration, open_particles, open_tracks, read_image
-    from lfpiv_cli.verbs.reconstruct import reconstruct
-    from lfpiv_cli.verbs.tracks import track
+    from lfpiv_cli.errors import LfpivError as LfpivError
+    from lfpiv_cli.files.calibration_file import open_calibration as open_calibration
+    from lfpiv_cli.files.config import load_rig as load_rig
+    from lfpiv_cli.files.images import read_image as read_image
+    from lfpiv_cli.files.particle_file import open_particles as open_particles
+    from lfpiv_cli.files.particle_file import open_tracks as open_tracks
+    from lfpiv_cli.files.vtkhdf import open_vectors as open_vectors
+    from lfpiv_cli.files.vtkhdf import open_volume as open_volume
+    from lfpiv_cli.files.weights_file import open_weights as open_weights
+    from lfpiv_cli.flow.combining import combine as combine
+    from lfpiv_cli.notice import LfpivWarning as LfpivWarning
+    from lfpiv_cli.verbs.build_weights import build_weights as build_weights
+    from lfpiv_cli.verbs.calibrate import calibrate as calibrate
+    from lfpiv_cli.verbs.correlate import correlate as correlate
+    from lfpiv_cli.verbs.fields import fit_field as fit_field
+    from lfpiv_cli.verbs.following import follow as follow
+    from lfpiv_cli.verbs.particles import find_particles as find_particles
+    from lfpiv_cli.verbs.reconstruct import reconstruct as reconstruct
+    from lfpiv_cli.verbs.tracks import track as track
 
 __version__ = "0.1.0"
-__all__ = [
-    "LfpivError",
-    "LfpivWarning",
-    "__version__",
-    "build_weights",
-    "calibrate",
-    "combine",
-    "correlate",
-    "find_particles",
-    "fit_field",
-    "follow",
-    "load_rig",
-    "open_calibration",
-    "open_particles",
-    "open_tracks",
-    "open_vectors",
-    "open_volume",
-    "open_weights",
-    "read_image",
-    "reconstruct",
-    "track",
-]
 
-# Where each name is from: they are imported when they are asked for, so that `lfpiv --help` need not wait for them.
+# What is promised, and where each name is from: they are imported when they are asked for, so that `lfpiv --help` need
+# not wait for them.
 MODULES = {
     "LfpivError": "errors",
     "LfpivWarning": "notice",
@@ -93,17 +77,18 @@ MODULES = {
     "find_particles": "verbs.particles",
     "fit_field": "verbs.fields",
     "follow": "verbs.following",
-    "load_rig": "verbs.readers",
-    "open_calibration": "verbs.readers",
-    "open_particles": "verbs.readers",
-    "open_tracks": "verbs.readers",
+    "load_rig": "files.config",
+    "open_calibration": "files.calibration_file",
+    "open_particles": "files.particle_file",
+    "open_tracks": "files.particle_file",
     "open_vectors": "files.vtkhdf",
     "open_volume": "files.vtkhdf",
     "open_weights": "files.weights_file",
-    "read_image": "verbs.readers",
+    "read_image": "files.images",
     "reconstruct": "verbs.reconstruct",
     "track": "verbs.tracks",
 }
+__all__ = ["__version__", *MODULES]
 
 # Before any kernel is imported.
 ensure_place()

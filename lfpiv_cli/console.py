@@ -116,7 +116,18 @@ class Console:
             with tqdm(total=total, desc=label, file=sys.stderr, leave=False) as bar:
                 yield lambda steps: bar.update(steps) and None
         else:
-            yield _Lines(self, total, label).advance
+            begun = told = time.monotonic()
+            done = 0
+
+            def advance(steps: int) -> None:
+                nonlocal told, done
+                done, now = done + steps, time.monotonic()
+                if now - told >= SECONDS_BETWEEN_LINES and done:
+                    told, rate = now, done / (now - begun)
+                    left = _duration(max(total - done, 0) / rate)
+                    self.say(f"{label}: {done} of {total} steps, {written(rate)} a second, {left} left")
+
+            yield advance
 
     @contextmanager
     def frames(self, total: int, steps: float, label: str, unit: str = "frame") -> Iterator[Frames]:
@@ -189,27 +200,6 @@ class Frames:
             self.console.say(f"{self._label}: {name}, {count}, {written(each)} s each, {_duration(left)} left")
 
 
-class _Lines:
-    """A line now and then on how far a work is, where no bar can be drawn."""
-
-    def __init__(self, console: Console, total: int, label: str) -> None:
-        """Take how many steps there are."""
-        self._console, self._total, self._label = console, total, label
-        self._begun = self._told = time.monotonic()
-        self._done = 0
-
-    def advance(self, steps: int) -> None:
-        """Take so many steps."""
-        self._done += steps
-        now = time.monotonic()
-        if now - self._told < SECONDS_BETWEEN_LINES or not self._done:
-            return
-        self._told = now
-        rate = self._done / (now - self._begun)
-        left = _duration(max(self._total - self._done, 0) / rate)
-        self._console.say(f"{self._label}: {self._done} of {self._total} steps, {written(rate)} a second, {left} left")
-
-
 # For those who call a stage from Python and say nothing of it.
 CONSOLE = Console()
 
@@ -237,15 +227,11 @@ def _blocks(figures: Mapping[str, Any]) -> list[dict[str, Any]]:
             blocks[-1][of] = row
         else:
             blocks.append({of: row})
-    return [_turned(block) if all(map(_is_row, block.values())) else block for block in blocks]
-
-
-def _turned(block: dict[str, Any]) -> dict[str, Any]:
-    """Return a table with its longer side downwards."""
-    heads = list(next(iter(block.values()), {}))
-    if len(heads) <= len(block):
-        return block
-    return {head: {name: row.get(head) for name, row in block.items()} for head in heads}
+    for k, block in enumerate(blocks):
+        heads = list(next(iter(block.values()), {})) if all(map(_is_row, block.values())) else []
+        if len(heads) > len(block):
+            blocks[k] = {head: {name: row.get(head) for name, row in block.items()} for head in heads}
+    return blocks
 
 
 def _unfolded(figures: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:

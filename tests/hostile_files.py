@@ -11,7 +11,7 @@ import h5py
 
 from lfpiv_cli.cli.main import cli
 from lfpiv_cli.cli.options import outcome_of
-from lfpiv_cli.files.hdf5_checks import DIGEST, write_digest
+from lfpiv_cli.files.hdf5 import DIGEST, write_digest
 
 
 def ended(*arguments: object) -> tuple[int, str]:

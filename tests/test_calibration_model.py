@@ -25,6 +25,7 @@ from lfpiv_cli.calibration.model import (
     with_mid_plane,
 )
 from lfpiv_cli.errors import InputError
+from lfpiv_cli.files.calibration_file import calibration_of, tree_of
 from lfpiv_cli.optics.camera import Camera, Lattice
 from lfpiv_cli.optics.media import Media
 
@@ -111,9 +112,9 @@ def test_summary_and_tree_bring_everything_back_without_nan(plain: Calibration, 
     unknown = {name for name, value in summary.items() if value is None and not name.startswith("dlfc_")}
     assert (unknown == {"image_distance_mm", "image_distance_mm_sigma"}) == with_board
     assert summary["lenses"] == plain.fit.lenses
-    tree = calibration.to_tree()
+    tree = tree_of(calibration)
     assert all(isinstance(leaf, np.ndarray | int | float | str | None) for leaf in leaves(tree))
-    back = Calibration.from_tree(tree)
+    back = calibration_of(tree)
     assert back.summary() == calibration.summary()
     assert back.image_shape == calibration.image_shape
     np.testing.assert_array_equal(back.transmission, calibration.transmission)
@@ -131,10 +132,10 @@ def leaves(tree: dict[str, Any]) -> list[Any]:
 
 
 def test_a_tree_with_a_hole_and_a_board_of_another_shape_are_refused(plain: Calibration, rig: Rig) -> None:
-    tree = plain.to_tree()
+    tree = tree_of(plain)
     del tree["lattice"]["indices"]
     with pytest.raises(InputError, match="not complete"):
-        Calibration.from_tree(tree)
+        calibration_of(tree)
     with pytest.raises(InputError, match=r"\(180, 220\), \(3, 3\)"):
         calibrate(Photographs([white_image()], board=np.zeros((3, 3))), rig)
 

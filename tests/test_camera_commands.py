@@ -17,7 +17,7 @@ from lfpiv_cli.cli.main import cli
 from lfpiv_cli.errors import ConfigError, InputError
 from lfpiv_cli.files.batch import frames_of
 from lfpiv_cli.files.config import load_config
-from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, read_points, read_tracks, write_points
+from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, open_tracks, read_points, write_points
 from lfpiv_cli.files.provenance import carried_record, even_step_s, seconds_between, sha256
 from lfpiv_cli.files.vtkhdf import open_vectors, open_volume
 from lfpiv_cli.verbs import run as run_stage
@@ -231,7 +231,7 @@ def pair(tmp_path: Path, rng: np.random.Generator) -> list[Path]:
 
 def test_track_takes_the_recorded_time(pair: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run("track", *pair, "--grid", "-o", tmp_path / "tracks.vtkhdf")
-    tracks = read_tracks(tmp_path / "tracks.vtkhdf")
+    tracks = open_tracks(tmp_path / "tracks.vtkhdf")
     np.testing.assert_allclose(tracks.arrays["velocity"], 0.025)
     assert open_vectors(tmp_path / "tracks_grid.vtkhdf").dt_s == pytest.approx(0.004)
     capsys.readouterr()
@@ -241,7 +241,7 @@ def test_track_takes_the_recorded_time(pair: list[Path], tmp_path: Path, capsys:
     (warning,) = json.loads(capsys.readouterr().out)["warnings"]
     assert (warning["code"], warning["expected"]) == ("time-between-frames", "0.002")
     assert warning["measured"] == pytest.approx(0.004)
-    np.testing.assert_allclose(read_tracks(tmp_path / "stated.vtkhdf").arrays["velocity"], 0.05)
+    np.testing.assert_allclose(open_tracks(tmp_path / "stated.vtkhdf").arrays["velocity"], 0.05)
     points = read_points(pair[1], PARTICLES_FORMAT)
     unknown = points.provenance | made(None)
     write_points(pair[1], PARTICLES_FORMAT, replace(points, provenance=unknown), overwrite=True)

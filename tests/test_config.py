@@ -16,7 +16,7 @@ import yaml
 from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.files.config import Config, load_config
 from lfpiv_cli.files.sections import Section
-from lfpiv_cli.files.sections_simulated import Sections
+from lfpiv_cli.files.sections_work import Sections
 from lfpiv_cli.flow.windows import ParallelWalls, RoundWall, layout_windows
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import fluid_path_to_focus

@@ -307,7 +307,7 @@ def test_a_weights_file_holds_them(table2, tube, tmp_path, operator_kind):
         for one, other in zip(found.column(*index), content.column(*index), strict=True):
             np.testing.assert_array_equal(one, other)
     assert found.weights.voxels_outside_fluid == content.weights.voxels_outside_fluid > 0
-    assert read_tree(path, FORMAT, (VERSION,))[0]["grid"]["voxels_outside_fluid"] == found.weights.voxels_outside_fluid
+    assert read_tree(path, FORMAT, VERSION)[0]["grid"]["voxels_outside_fluid"] == found.weights.voxels_outside_fluid
     if operator_kind == "on demand":
         assert found.weights.solver_operator.source == tube
         return
@@ -337,7 +337,7 @@ def test_strips_that_contradict_themselves_are_refused(table2, tube, tmp_path, g
     camera = replace(table2, columns=300)
     weights = Weights(BESIDE, (0, 0, 0), operator_of(camera, tube, BESIDE), "x")
     write_weights(path, WeightsFile(weights, camera, Reference("focal_point", 0.0), {}), False)
-    tree, provenance = read_tree(path, FORMAT, (VERSION,))
+    tree, provenance = read_tree(path, FORMAT, VERSION)
     tree[group][name] = tree[group][name] + int(value.split()[-1]) if isinstance(value, str) else value
     form = {"format_name": FORMAT, "format_version": VERSION, "units": UNITS}
     write_tree(edited, tree, **form, provenance=provenance, overwrite=False)

@@ -16,7 +16,7 @@ import pytest
 
 from lfpiv_cli.errors import InputError, OutputError, OutputExistsError, UsageError
 from lfpiv_cli.files import atomic
-from lfpiv_cli.files.atomic import ensure_writable, folder_of, write_atomically, write_json
+from lfpiv_cli.files.atomic import ensure_writable, folder_of, write_json, written_atomically
 from lfpiv_cli.files.hdf5 import read_tree, write_tree
 from lfpiv_cli.files.provenance import record
 from lfpiv_cli.files.vtkhdf import open_vectors, open_volume, read_header, write_vectors, write_volume
@@ -51,7 +51,7 @@ def save_tree(path: Path) -> Path:
 
 
 def load_tree(path: Path) -> dict:
-    return read_tree(path, "lfpiv-test", (2,))[0]
+    return read_tree(path, "lfpiv-test", 2)[0]
 
 
 def refused(read: Callable[[], object], *words: str) -> bool:
@@ -85,15 +85,16 @@ def test_a_failed_write_leaves_the_old_file_and_no_other(tmp_path: Path) -> None
     target = tmp_path / "out.bin"
     target.write_bytes(b"old")
 
-    def fail(temporary: Path) -> None:
-        temporary.write_bytes(b"half")
-        raise KeyboardInterrupt
+    def fail() -> None:
+        with written_atomically(target, overwrite=True) as temporary:
+            temporary.write_bytes(b"half")
+            raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        write_atomically(target, fail, overwrite=True)
+        fail()
     # What does not read back is not published.
-    with pytest.raises(OutputError, match="does not read back"):
-        write_atomically(target, lambda path: None, overwrite=True, check=wrong)
+    with pytest.raises(OutputError, match="not read back"), written_atomically(target, overwrite=True, check=wrong):
+        pass
     assert target.read_bytes() == b"old"
     assert os.listdir(tmp_path) == ["out.bin"]
 
@@ -101,7 +102,8 @@ def test_a_failed_write_leaves_the_old_file_and_no_other(tmp_path: Path) -> None
 def test_permissions_follow_the_umask(tmp_path: Path) -> None:
     before = os.umask(0o027)
     try:
-        write_atomically(tmp_path / "out", lambda path: None, overwrite=False)
+        with written_atomically(tmp_path / "out", overwrite=False):
+            pass
     finally:
         os.umask(before)
     assert (tmp_path / "out").stat().st_mode & 0o777 == 0o640
@@ -125,8 +127,8 @@ def test_missing_folders_are_made_with_the_first_file_in_them_and_not_before(tmp
     target = tmp_path / "new" / "deep" / "out"
     ensure_writable(target, overwrite=False)
     assert os.listdir(tmp_path) == []
-    with pytest.raises(OutputError, match="does not read back"):
-        write_atomically(target, lambda _: None, overwrite=False, check=wrong)
+    with pytest.raises(OutputError, match="not read back"), written_atomically(target, overwrite=False, check=wrong):
+        pass
     assert os.listdir(tmp_path) == []
     with folder_of(target), folder_of(target.with_name("other")):
         assert target.parent.is_dir()
@@ -161,7 +163,7 @@ def test_read_only_folder_is_refused_early(tmp_path: Path) -> None:
 
 
 def test_tree_round_trip(tmp_path: Path) -> None:
-    tree, provenance = read_tree(save_tree(tmp_path / "t.h5"), "lfpiv-test", (1, 2))
+    tree, provenance = read_tree(save_tree(tmp_path / "t.h5"), "lfpiv-test", 2)
     assert provenance == {"command": "test"}
     assert tree["array"].dtype == np.float64
     np.testing.assert_array_equal(tree["array"], TREE["array"])
@@ -205,8 +207,8 @@ def test_damage_is_never_read_as_data(tmp_path: Path, damage: str) -> None:
 
 def test_other_formats_versions_and_kinds_are_refused(tmp_path: Path) -> None:
     path = save_tree(tmp_path / "t.h5")
-    assert refused(lambda: read_tree(path, "lfpiv-weights", (2,)), "holds lfpiv-test, expected lfpiv-weights")
-    assert refused(lambda: read_tree(path, "lfpiv-test", (3, 4)), "version 2", "reads 3, 4")
+    assert refused(lambda: read_tree(path, "lfpiv-weights", 2), "holds lfpiv-test, expected lfpiv-weights")
+    assert refused(lambda: read_tree(path, "lfpiv-test", 3), "version 2", "reads 3")
     with h5py.File(tmp_path / "foreign.h5", "w") as file:
         file["a"] = 1.0
     assert refused(lambda: load_tree(tmp_path / "foreign.h5"), "no format of ours")
@@ -351,8 +353,8 @@ def test_records_are_carried_along_and_say_nothing_of_time_or_place(tmp_path: Pa
 
 
 def test_what_a_killed_process_had_begun_to_write_is_removed(tmp_path: Path) -> None:
-    killed = "import os, pathlib, signal, sys; from lfpiv_cli.files.atomic import write_atomically as write; " + (
-        "write(pathlib.Path(sys.argv[1]), lambda path: os.kill(os.getpid(), signal.SIGKILL), overwrite=False)"
+    killed = "import os, pathlib, sys; from lfpiv_cli.files.atomic import written_atomically as write; " + (
+        "made = write(pathlib.Path(sys.argv[1]), overwrite=False); made.__enter__(); os.kill(os.getpid(), 9)"
     )
     subprocess.run([sys.executable, "-c", killed, tmp_path / "x.json"], cwd=ROOT, check=False)
     (left,) = tmp_path.iterdir()

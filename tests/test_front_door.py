@@ -15,7 +15,7 @@ import lfpiv_cli
 from lfpiv_cli.files import images
 from lfpiv_cli.files.recordings.recording import Recording
 from lfpiv_cli.files.sections import Section
-from lfpiv_cli.files.sections_simulated import flow_of
+from lfpiv_cli.files.sections_work import flow_of
 from lfpiv_cli.flow.correlation import correlate
 from lfpiv_cli.flow.windows import WEIGHTINGS, CorrelationSettings
 from lfpiv_cli.grid import Grid

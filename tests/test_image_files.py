@@ -23,9 +23,9 @@ import tifffile
 
 from lfpiv_cli.cli.options import print_json
 from lfpiv_cli.errors import InputError
-from lfpiv_cli.files.images import count_pages, read_image, read_page, write_tiff
+from lfpiv_cli.files.images import count_pages, read_image, read_single, write_tiff
 from lfpiv_cli.files.listing import ensure_verified
-from lfpiv_cli.files.recordings import tiff
+from lfpiv_cli.files.recordings import formats
 from lfpiv_cli.files.recordings.recording import taken_complaints
 from tests import camera_files
 from tests.commands import CONFIG, ROOT, SAMPLE
@@ -86,7 +86,7 @@ def test_images_without_numbers_are_judged(tmp_path: Path, weights: Path, capsys
 
 def pages_of(path: Path, shape: tuple[int, int] | None = None) -> list[np.ndarray]:
     """Every page of an image file, as a batch reads them."""
-    return [read_page(path, page, shape) for page in range(count_pages(path))]
+    return [read_image(path, page, shape) for page in range(count_pages(path))]
 
 
 # Images
@@ -115,7 +115,7 @@ def test_every_kind_of_tiff_gives_the_same_frames_and_none_is_lost(tmp_path: Pat
     tifffile.imwrite(path, FRAMES, photometric="minisblack", **options)
     assert count_pages(path) == 3
     np.testing.assert_array_equal(pages_of(path, (40, 50)), FRAMES)
-    assert read_page(path, 2).dtype == np.float32
+    assert read_image(path, 2).dtype == np.float32
     whole = path.read_bytes()
     for percent in range(1, 100):
         path.write_bytes(whole[: len(whole) * percent // 100])
@@ -126,13 +126,13 @@ def test_every_kind_of_tiff_gives_the_same_frames_and_none_is_lost(tmp_path: Pat
 def test_kinds_of_pixels(tmp_path: Path, kind: str) -> None:
     image = FRAMES[0].astype(kind)
     tifffile.imwrite(tmp_path / "t.tif", image, photometric="minisblack")
-    np.testing.assert_array_equal(read_image(tmp_path / "t.tif"), image.astype(np.float32))
+    np.testing.assert_array_equal(read_single(tmp_path / "t.tif"), image.astype(np.float32))
 
 
 def test_not_a_number_is_passed_on(tmp_path: Path) -> None:
     image = np.array([[1.0, np.nan], [np.inf, 1e300]])
     tifffile.imwrite(tmp_path / "t.tif", image, photometric="minisblack")
-    np.testing.assert_array_equal(read_image(tmp_path / "t.tif"), [[1.0, np.nan], [np.inf, np.inf]])
+    np.testing.assert_array_equal(read_single(tmp_path / "t.tif"), [[1.0, np.nan], [np.inf, np.inf]])
 
 
 @pytest.mark.parametrize("bits", [8, 16])
@@ -140,14 +140,14 @@ def test_png(tmp_path: Path, bits: int) -> None:
     path = tmp_path / "t.png"
     image = FRAMES[0].astype(f"u{bits // 8}")
     path.write_bytes(cv2.imencode(".png", image)[1].tobytes())
-    np.testing.assert_array_equal(read_image(path, (40, 50)), image)
+    np.testing.assert_array_equal(read_single(path, (40, 50)), image)
     assert count_pages(path) == 1
     whole = path.read_bytes()
     for percent in range(1, 100):
         path.write_bytes(whole[: len(whole) * percent // 100])
-        assert refused(lambda: read_image(path), "t.png: "), percent
+        assert refused(lambda: read_single(path), "t.png: "), percent
     path.write_bytes(whole[:100] + bytes([whole[100] ^ 1]) + whole[101:])
-    assert refused(lambda: read_image(path), "check sum")
+    assert refused(lambda: read_single(path), "check sum")
 
 
 GREY = FRAMES[0].astype(np.uint8)
@@ -166,10 +166,10 @@ def test_grey_saved_as_colour_is_read(tmp_path: Path, kind: str) -> None:
     image, options = IN_COLOUR[kind]
     tifffile.imwrite(tmp_path / "t.tif", image, **options)
     grey = FRAMES[0] if kind == "16 bits" else GREY
-    np.testing.assert_array_equal(read_image(tmp_path / "t.tif", (40, 50)), grey)
+    np.testing.assert_array_equal(read_single(tmp_path / "t.tif", (40, 50)), grey)
     if kind in ("rgb", "16 bits", "opaque"):
         (tmp_path / "t.png").write_bytes(imagecodecs.png_encode(image))
-        np.testing.assert_array_equal(read_image(tmp_path / "t.png", (40, 50)), grey)
+        np.testing.assert_array_equal(read_single(tmp_path / "t.png", (40, 50)), grey)
 
 
 @pytest.mark.parametrize("kind", ["rgb", "apart", "opaque", "palette", "miniswhite"])
@@ -182,10 +182,10 @@ def test_colour_is_refused_with_a_hint(tmp_path: Path, kind: str) -> None:
         # one pixel's blue, or how transparent it is
         image[(2, 5, 7) if kind == "apart" else (5, 7, -1)] ^= 1
     tifffile.imwrite(tmp_path / "t.tif", image, **options)
-    assert refused(lambda: read_image(tmp_path / "t.tif"), "save the sensor's raw image as greyscale")
+    assert refused(lambda: read_single(tmp_path / "t.tif"), "save the sensor's raw image as greyscale")
     if kind in ("rgb", "opaque"):
         (tmp_path / "t.png").write_bytes(imagecodecs.png_encode(image))
-        assert refused(lambda: read_image(tmp_path / "t.png"), "save the sensor's raw image as greyscale")
+        assert refused(lambda: read_single(tmp_path / "t.png"), "save the sensor's raw image as greyscale")
 
 
 def test_another_size_is_refused_with_both(tmp_path: Path) -> None:
@@ -193,9 +193,9 @@ def test_another_size_is_refused_with_both(tmp_path: Path) -> None:
     tifffile.imwrite(path, FRAMES[0], photometric="minisblack")
     tifffile.imwrite(path, FRAMES[0, :30], photometric="minisblack", append=True)
     assert refused(lambda: pages_of(path, (40, 50)), "page 1 is 50 x 30 pixels", "50 x 40")
-    assert refused(lambda: read_page(path, 0, (1768, 2352)), "page 0 is 50 x 40", "2352 x 1768")
-    assert refused(lambda: read_page(path, 2), "no page 2, it holds 2")
-    assert refused(lambda: read_image(path), "holds 2 pages, expected a single image")
+    assert refused(lambda: read_image(path, 0, (1768, 2352)), "page 0 is 50 x 40", "2352 x 1768")
+    assert refused(lambda: read_image(path, 2), "no page 2, it holds 2")
+    assert refused(lambda: read_single(path), "holds 2 pages, expected a single image")
 
 
 @pytest.mark.parametrize("options", [{}, {"imagej": True}])
@@ -231,7 +231,7 @@ NOTHING = zlib.compress(bytes(20_000))
 
 def test_an_honest_tiff_of_that_kind_is_read(tmp_path: Path) -> None:
     (tmp_path / "t.tif").write_bytes(tiff_file(100, 100, NOTHING, 8))
-    np.testing.assert_array_equal(read_image(tmp_path / "t.tif"), np.zeros((100, 100)))
+    np.testing.assert_array_equal(read_single(tmp_path / "t.tif"), np.zeros((100, 100)))
 
 
 # What is no image that could be, and words of what is said of it.
@@ -278,14 +278,14 @@ def test_written_images_read_back_and_hold_no_time(tmp_path: Path) -> None:
         write_tiff(tmp_path / "a.tif", image, overwrite=True)
         time.sleep(0.01)
         write_tiff(tmp_path / "b.tif", image, overwrite=True)
-        np.testing.assert_array_equal(read_image(tmp_path / "a.tif"), image)
+        np.testing.assert_array_equal(read_single(tmp_path / "a.tif"), image)
         assert (tmp_path / "a.tif").read_bytes() == (tmp_path / "b.tif").read_bytes()
     with tifffile.TiffFile(tmp_path / "a.tif") as file:
         assert not {"DateTime", "Software"} & {tag.name for tag in file.pages[0].tags}
 
 
 def test_the_experiments_images(data_folder: Path) -> None:
-    image = read_image(data_folder / "channel" / "dark.tif", (1768, 2352))
+    image = read_single(data_folder / "channel" / "dark.tif", (1768, 2352))
     assert image.mean() == pytest.approx(96.0, abs=0.1)  # the dark level, read noise 6 over four million pixels
 
 
@@ -313,7 +313,7 @@ def directories(count: int, tags: tuple[int, ...] = (256, 257, 273)) -> bytes:
 
 
 def test_directories_without_an_image_or_an_end_are_given_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(tiff, "MOST_PAGES", 50)
+    monkeypatch.setattr(formats, "MOST_PAGES", 50)
     path = tmp_path / "many.tif"
     for content, words in (
         (directories(100, (256,)), "many.tif: the directory of page 0 is of no image"),
@@ -343,7 +343,7 @@ def test_a_png_that_unpacks_to_more_than_it_declares_is_refused(tmp_path: Path) 
     code, said = ended("check", CONFIG, path)
     assert (code, "more than the 600 x 448 pixels" in said) == (4, True), said
     path.write_bytes(png(7, 5, zlib.compress(bytes(5 * 8)), 8))
-    assert not read_image(path).any()
+    assert not read_single(path).any()
 
 
 def sums(folder: Path, *names: str) -> Path:
@@ -358,7 +358,7 @@ def sums(folder: Path, *names: str) -> Path:
 def test_a_list_of_sums_tells_what_the_format_cannot(tmp_path: Path, packed: str) -> None:
     frame, config = tmp_path / "a.tif", tmp_path / "rig.yaml"
     config.write_bytes(CONFIG.read_bytes())
-    tifffile.imwrite(frame, read_image(SAMPLE / "pair_a.tif").astype(np.uint16), compression=packed)
+    tifffile.imwrite(frame, read_single(SAMPLE / "pair_a.tif").astype(np.uint16), compression=packed)
     listed = sums(tmp_path, "a.tif", "rig.yaml")
     assert ended("check", config, frame, "--verify", listed, "-q") == (0, "")
     content = bytearray(frame.read_bytes())
@@ -394,7 +394,7 @@ def test_a_list_of_sums_has_all_inputs(tmp_path: Path) -> None:
 
 def test_what_a_decoder_complains_of_is_a_warning(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     frame = tmp_path / "a.tif"
-    tifffile.imwrite(frame, read_image(SAMPLE / "pair_a.tif").astype(np.uint16), software="x" * 40)
+    tifffile.imwrite(frame, read_single(SAMPLE / "pair_a.tif").astype(np.uint16), software="x" * 40)
     content = bytearray(frame.read_bytes())
     place = content.index(struct.pack("<HH", 305, 2))
     content[place + 2 : place + 4] = struct.pack("<H", 99)  # a kind of tag that there is not
@@ -462,7 +462,7 @@ def test_absurd_images_are_refused_quickly(tmp_path: Path, content: bytes, words
     path, begun = tmp_path / "t.img", time.thread_time()
     path.write_bytes(content)
     tracemalloc.start()
-    assert refused(lambda: read_image(path), words)
+    assert refused(lambda: read_single(path), words)
     assert tracemalloc.get_traced_memory()[1] < 100_000_000
     tracemalloc.stop()
     code, said = ended("calibrate-snapshot", CONFIG, "--white", path, "-o", tmp_path / "c.h5")

@@ -15,8 +15,7 @@ import numpy as np
 import pytest
 import yaml
 
-from lfpiv_cli.files.hdf5 import read_tree, write_tree
-from lfpiv_cli.files.hdf5_checks import DIGEST
+from lfpiv_cli.files.hdf5 import DIGEST, read_tree, write_tree
 from lfpiv_cli.files.images import count_pages
 from lfpiv_cli.files.particle_file import (
     PARTICLES_FORMAT,
@@ -154,7 +153,7 @@ def test_damaged_weights_reconstruct_nothing(tmp_path: Path, weights: Path, kind
         with edited(broken) as file:
             file.attrs["format_version"] = 999
     elif kind == "index":
-        tree, made = read_tree(broken, FORMAT, (VERSION,))
+        tree, made = read_tree(broken, FORMAT, VERSION)
         tree["rows"]["cell"][7] = 10**6
         form = {"format_name": FORMAT, "format_version": VERSION, "units": WEIGHT_UNITS}
         write_tree(broken, tree, **form, provenance=made, overwrite=True)

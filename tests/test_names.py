@@ -15,7 +15,7 @@ import pytest
 
 from lfpiv_cli.cli.main import cli
 from lfpiv_cli.files.sections import Section
-from lfpiv_cli.files.sections_simulated import CorrelationSection, FlowSection, Sections
+from lfpiv_cli.files.sections_work import CorrelationSection, FlowSection, Sections
 from lfpiv_cli.names import (
     BoardMethod,
     Divergence,

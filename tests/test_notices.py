@@ -28,7 +28,7 @@ from lfpiv_cli.cli.main import cli
 from lfpiv_cli.console import Console
 from lfpiv_cli.errors import ConfigError, InputError
 from lfpiv_cli.files.batch import Target, pending
-from lfpiv_cli.files.calibration_file import read_calibration
+from lfpiv_cli.files.calibration_file import open_calibration
 from lfpiv_cli.files.config import Config, load_config
 from lfpiv_cli.files.hdf5 import write_tree
 from lfpiv_cli.files.images import write_tiff
@@ -121,7 +121,7 @@ def test_a_warning_is_on_the_terminal_in_json_and_in_the_file(tmp_path: Path, ca
     record = earlier_record(output)
     assert record is not None
     assert record["warnings"] == [warning]
-    assert read_calibration(output).transmission is None
+    assert open_calibration(output).transmission is None
     cli.main(["info", str(output), "--json"], standalone_mode=False)
     (recorded,) = json.loads(capsys.readouterr().out)["warnings_recorded"]
     assert recorded == f"calibrate-snapshot: {line.removeprefix('lfpiv: warning: ').strip()}"

@@ -11,12 +11,12 @@ import pytest
 import tifffile
 
 from lfpiv_cli.cli.main import cli
-from lfpiv_cli.files.calibration_file import read_calibration
+from lfpiv_cli.files.calibration_file import open_calibration
 from lfpiv_cli.files.config import load_config
+from lfpiv_cli.files.particle_file import open_particles
 from lfpiv_cli.files.vtkhdf import open_vectors
 from lfpiv_cli.files.weights_file import open_weights
 from lfpiv_cli.flow.field import MASKED
-from lfpiv_cli.verbs.readers import open_particles
 from lfpiv_cli.weights.strips import StripOperator
 
 CONFIGS = Path(__file__).parent.parent / "configs"
@@ -138,7 +138,7 @@ def test_a_pipe_that_is_not_where_it_was_said_is_found_and_measured(
     by_wall, sigma = np.array(figures["axis_by_wall_shift_mm"]), np.array(figures["axis_by_wall_shift_mm_sigma"])
     assert np.all(np.abs(by_wall - (-0.1, 0.15)) < 3.0 * sigma)
     assert (tmp_path / "walls.png").stat().st_size > 10_000
-    pipe = load_config(tmp_path / "told.yaml").with_scene_of(read_calibration(refined)).pipe
+    pipe = load_config(tmp_path / "told.yaml").with_scene_of(open_calibration(refined)).pipe
     assert pipe is not None
     np.testing.assert_allclose(pipe.centre_mm[1:], (-0.1, 0.15), atol=0.01)
 

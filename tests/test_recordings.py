@@ -23,8 +23,8 @@ from lfpiv_cli.errors import InputError, UsageError
 from lfpiv_cli.files import images
 from lfpiv_cli.files.inputs import split_part
 from lfpiv_cli.files.provenance import record, sha256
-from lfpiv_cli.files.recordings import tiff
-from lfpiv_cli.files.recordings.blocks import PACKED_BITS, PATTERNS, Packing, Pixels, green_of
+from lfpiv_cli.files.recordings import formats
+from lfpiv_cli.files.recordings.recording import PACKED_BITS, PATTERNS, Packing, Pixels, green_of
 from tests import camera_files
 
 
@@ -33,19 +33,21 @@ def test_a_sequence_is_looked_through_once_and_again_when_it_changes(
 ) -> None:
     stack = np.arange(5 * 12, dtype=np.uint8).reshape(5, 3, 4)
     path, walks = tmp_path / "t.tif", []
-    monkeypatch.setattr(tiff, "directories", lambda *given, walk=tiff.directories: walks.append(1) or walk(*given))
+    monkeypatch.setattr(
+        formats, "directories", lambda *given, walk=formats.directories: walks.append(1) or walk(*given)
+    )
     tifffile.imwrite(path, stack, photometric="minisblack", metadata=None)
     for page in (3, 0, 4):
-        np.testing.assert_array_equal(images.read_page(path, page, (3, 4)), stack[page])
+        np.testing.assert_array_equal(images.read_image(path, page, (3, 4)), stack[page])
     assert images.count_pages(path) == 5
     assert len(walks) == 1
     for page in (-1, 5):
         with pytest.raises(InputError, match=f"has no page {page}, it holds 5"):
-            images.read_page(path, page)
+            images.read_image(path, page)
     before = path.stat()
     tifffile.imwrite(path, stack[::-1], photometric="minisblack", metadata=None)
     os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns + 1))
-    np.testing.assert_array_equal(images.read_page(path, 3), stack[1])
+    np.testing.assert_array_equal(images.read_image(path, 3), stack[1])
     assert len(walks) == 2
 
 
@@ -62,7 +64,7 @@ def stack_of(rng: np.random.Generator, bits: int, shape: tuple[int, int, int] = 
 
 def read_all(path: Path) -> None:
     for page in range(images.count_pages(path)):
-        images.read_page(path, page)
+        images.read_image(path, page)
 
 
 def kinds(folder: Path, rng: np.random.Generator) -> dict[str, tuple[Path, np.ndarray]]:
@@ -114,14 +116,14 @@ def test_each_format_gives_the_counts_and_times_that_were_written(
     found = images.frames(path)
     assert (found.pages, found.shape) == (3, (5, 7))
     for page in range(3):
-        image = images.read_page(path, page, (5, 7))
+        image = images.read_image(path, page, (5, 7))
         assert image.dtype == np.float32
         np.testing.assert_array_equal(image, stack[page])
     # Norpix' older versions have milliseconds.
     second = 0.0 if kind == "s8.seq" else 0.0005
     np.testing.assert_allclose(images.frames(path).time_s, [0.0, second, 0.001], rtol=0, atol=1e-9)
     with pytest.raises(InputError, match=r"7 x 5 pixels.*, expected the sensor's 8 x 5"):
-        images.read_page(path, 0, (5, 8))
+        images.read_image(path, 0, (5, 8))
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -178,11 +180,11 @@ def test_a_cine_packed_to_ten_bits_has_linear_counts(tmp_path: Path, monkeypatch
     codes = np.arange(1024, dtype=np.uint16).reshape(1, 32, 32)
     camera_files.write_cine(tmp_path / "t.cine", codes, packed=10)
     assert images.frames(tmp_path / "t.cine").bits == 12
-    counts = images.read_page(tmp_path / "t.cine", 0).ravel()
+    counts = images.read_image(tmp_path / "t.cine", 0).ravel()
     # The manufacturer's anchors: black stays, white is at 4064 of 4095; and more light is never darker.
     assert (counts[64], counts[1014], counts[1023]) == (64, 4064, 4095)
     assert (np.diff(counts) >= 0).all()
-    images.read_page.__globals__["_frames"].cache_clear()
+    images.read_image.__globals__["_frames"].cache_clear()
     monkeypatch.setitem(sys.modules, "cine_reader.unpack", None)
     with pytest.raises(UsageError, match=re.escape('t.cine: is packed to 10 bits: pip install "lfpiv[cameras]"')):
         images.frames(tmp_path / "t.cine")
@@ -197,7 +199,7 @@ def test_images_of_davis(tmp_path: Path, rng: np.random.Generator) -> None:
         found = images.frames(path)
         assert (found.pages, found.shape, found.bits, found.time_s) == (2, (30, 40), 8 * stack.itemsize, None)
         for page in range(2):
-            np.testing.assert_array_equal(images.read_page(path, page, (30, 40)), stack[page])
+            np.testing.assert_array_equal(images.read_image(path, page, (30, 40)), stack[page])
         content = path.read_bytes()
         # After the counts the file has attributes.
         end = 260 + struct.unpack_from("<I", content, 256)[0] if packed else 256 + stack.nbytes
@@ -210,7 +212,7 @@ def test_images_of_davis(tmp_path: Path, rng: np.random.Generator) -> None:
             flipped[end // 2] ^= 1
             path.write_bytes(flipped)
             with pytest.raises(InputError, match=r"B00001\.im7: (cannot be unpacked|does not unpack)"):
-                images.read_page(path, 0)
+                images.read_image(path, 0)
 
 
 @pytest.mark.parametrize(
@@ -237,11 +239,11 @@ def test_headers_of_davis_that_do_not_fit(tmp_path: Path, header: tuple[int, ...
 def test_packed_images_of_davis_end_with_their_check_sum(tmp_path: Path, rng: np.random.Generator) -> None:
     path, stack = tmp_path / "t.im7", stack_of(rng, 16)
     camera_files.write_im7(path, stack)
-    np.testing.assert_array_equal(images.read_page(path, 1), stack[1])
+    np.testing.assert_array_equal(images.read_image(path, 1), stack[1])
     (length,) = struct.unpack_from("<I", path.read_bytes(), 256)
     edited(path, 256, "<I", length - 2)
     with pytest.raises(InputError, match="does not unpack to 3 frames"):
-        images.read_page(path, 1)
+        images.read_image(path, 1)
 
 
 def test_a_set_of_davis_is_the_frames_of_its_images_one_after_the_other(
@@ -256,13 +258,13 @@ def test_a_set_of_davis_is_the_frames_of_its_images_one_after_the_other(
     found = images.frames(path)
     assert (found.pages, found.shape, found.bits, found.time_s) == (11, (5, 7), 16, None)
     for page, expected in enumerate(np.concatenate(stacks)):
-        np.testing.assert_array_equal(images.read_page(path, page, (5, 7)), expected)
-    np.testing.assert_array_equal(images.read_image(Path(f"{path}:page=2")), stacks[1][1])
+        np.testing.assert_array_equal(images.read_image(path, page, (5, 7)), expected)
+    np.testing.assert_array_equal(images.read_single(Path(f"{path}:page=2")), stacks[1][1])
     camera_files.write_im7(tmp_path / "run" / "b11.im7", stacks[0])
     assert images.count_pages(path) == 12
     camera_files.write_im7(tmp_path / "run" / "b2.IM7", stacks[0])
     with pytest.raises(InputError, match=r"b2\.IM7: holds 1 frames, fewer than"):
-        images.read_page(path, 2)
+        images.read_image(path, 2)
 
 
 def test_sets_as_lavision_writes_them(tmp_path: Path, rng: np.random.Generator) -> None:
@@ -270,7 +272,7 @@ def test_sets_as_lavision_writes_them(tmp_path: Path, rng: np.random.Generator) 
     stacks = [stack_of(rng, 12, (2, 30, 40)) for _ in range(3)]
     lvpyio.write_set([lvpyio.arrays_to_buffer(list(stack)) for stack in stacks], str(tmp_path / "run.set"))
     for page, expected in enumerate(np.concatenate(stacks)):
-        np.testing.assert_array_equal(images.read_page(tmp_path / "run.set", page), expected)
+        np.testing.assert_array_equal(images.read_image(tmp_path / "run.set", page), expected)
 
 
 def _only_vectors(folder: Path) -> None:
@@ -391,18 +393,18 @@ def test_places_and_notes_of_a_cine_must_lie_in_it(tmp_path: Path, rng: np.rando
             images.frames(path)
         camera_files.write_cine(path, stack)
         edited(path, first + place, "<I", value)
-        np.testing.assert_array_equal(images.read_page(path, 1), stack[1])
+        np.testing.assert_array_equal(images.read_image(path, 1), stack[1])
         with pytest.raises(InputError, match=words):
-            images.read_page(path, 0)
+            images.read_image(path, 0)
 
 
 def test_other_ways_of_writing_a_cine(tmp_path: Path, rng: np.random.Generator) -> None:
     path, stack = tmp_path / "t.cine", stack_of(rng, 8, (2, 4, 5))
     camera_files.write_cine(path, stack, times=False, tight=True)
-    np.testing.assert_array_equal(images.read_page(path, 1), stack[1])
+    np.testing.assert_array_equal(images.read_image(path, 1), stack[1])
     np.testing.assert_allclose(images.frames(path).time_s, [0.0, 1 / camera_files.RATE_HZ])
     edited(path, 52, "<i", -4)
-    np.testing.assert_array_equal(images.read_page(path, 1), stack[1, ::-1])
+    np.testing.assert_array_equal(images.read_image(path, 1), stack[1, ::-1])
     camera_files.write_cine(path, stack, filters=3)
     with pytest.raises(InputError, match="frames of a colour sensor.*bayer=RGGB"):
         images.frames(path)
@@ -488,7 +490,7 @@ def test_frames_without_a_header_lie_as_stated(tmp_path: Path, rng: np.random.Ge
     for content in (path.read_bytes(), path.read_bytes() + gap):
         path.write_bytes(content)
         assert images.count_pages(tmp_path / f"t.bin:{layout}") == 3
-        np.testing.assert_array_equal(images.read_page(tmp_path / f"t.bin:{layout}", 2), stack[2])
+        np.testing.assert_array_equal(images.read_image(tmp_path / f"t.bin:{layout}", 2), stack[2])
     with pytest.raises(InputError, match=r"3\.\d\d frames .*expected a whole number"):
         images.frames(tmp_path / "t.bin:7x5x16:header=4")
     with pytest.raises(InputError, match="frames"):
@@ -501,7 +503,7 @@ def test_green_of_a_colour_sensor(tmp_path: Path, rng: np.random.Generator, patt
     mosaic = stack_of(rng, 16, (1, 5, 6))[0]
     green = np.array([[pattern[2 * (row % 2) + column % 2] == "G" for column in range(6)] for row in range(5)])
     (tmp_path / "t.raw").write_bytes(mosaic.tobytes())
-    seen = images.read_page(tmp_path / f"t.raw:6x5x16:bayer={pattern}", 0)
+    seen = images.read_image(tmp_path / f"t.raw:6x5x16:bayer={pattern}", 0)
     np.testing.assert_array_equal(seen[green], mosaic[green])
     row, column = np.argwhere(~green)[np.argmax(np.all(np.argwhere(~green) % 4 > 0, axis=1))]
     beside = mosaic[[row - 1, row + 1, row, row], [column, column, column - 1, column + 1]]
@@ -524,7 +526,7 @@ def test_stacks_that_are_refused(tmp_path: Path, rng: np.random.Generator) -> No
         layout = h5py.VirtualLayout(stack.shape, "u2")
         layout[:] = h5py.VirtualSource("other.h5", "frames", stack.shape)
         file.create_virtual_dataset("virtual", layout)
-    np.testing.assert_array_equal(images.read_image(tmp_path / "t.h5:/flat"), stack[0])
+    np.testing.assert_array_equal(images.read_single(tmp_path / "t.h5:/flat"), stack[0])
     for name, words in {
         "": "holds 6 datasets of frames, expected one, or to be told which: t.h5:/a, t.h5:/b",
         ":/line": "expected numbers of (frames, rows, columns)",
@@ -564,12 +566,12 @@ def test_nothing_stays_open(tmp_path: Path, rng: np.random.Generator) -> None:
 def test_one_page_of_any_recording_is_an_image(tmp_path: Path, rng: np.random.Generator, kind: str) -> None:
     given, stack = kinds(tmp_path, rng)[kind]
     with pytest.raises(InputError, match="holds 3 pages, expected a single image; .*:page=0 is the first one"):
-        images.read_image(given)
+        images.read_single(given)
     one = Path(f"{given}:page=2")
-    np.testing.assert_array_equal(images.read_image(one, (5, 7)), stack[2])
+    np.testing.assert_array_equal(images.read_single(one, (5, 7)), stack[2])
     np.testing.assert_array_equal(images.frames(one).time_s, images.frames(given).time_s[2:])
     with pytest.raises(InputError, match="has no page 3, it holds 3"):
-        images.read_image(Path(f"{given}:page=3"))
+        images.read_single(Path(f"{given}:page=3"))
 
 
 @pytest.mark.thorough

@@ -11,7 +11,7 @@ import pytest
 
 from lfpiv_cli.cli.main import cli
 from lfpiv_cli.errors import ConfigError
-from lfpiv_cli.files.calibration_file import read_calibration, write_calibration
+from lfpiv_cli.files.calibration_file import open_calibration, write_calibration
 from lfpiv_cli.files.hdf5 import open_h5, read_provenance
 
 ROOT = Path(__file__).parent.parent
@@ -29,7 +29,7 @@ def wrong(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("refine")
     stills = ("--white", SAMPLE / "white.tif", "--dark", SAMPLE / "dark.tif", "--board", SAMPLE / "board.tif")
     run("calibrate-snapshot", CONFIG, *stills, "-o", folder / "calibration.h5")
-    right = read_calibration(folder / "calibration.h5")
+    right = open_calibration(folder / "calibration.h5")
     assert right.mid_plane_z_mm is not None
     path = folder / "wrong.h5"
     write_calibration(path, replace(right, mid_plane_z_mm=right.mid_plane_z_mm + WRONG_MM), {}, False)
@@ -48,10 +48,10 @@ def test_a_wrong_mid_plane_is_found_and_mended(wrong: Path, tmp_path: Path, caps
     assert abs(summary["mid_plane_z_mm"] - truth) < 3 * summary["mid_plane_z_mm_sigma"]
     assert summary["mid_plane_z_mm_sigma"] < 0.03
     assert summary["mid_plane_correction_mm"] == pytest.approx(-WRONG_MM, abs=0.06)
-    mended = read_calibration(output)
+    mended = open_calibration(output)
     assert mended.mid_plane_z_mm == summary["mid_plane_z_mm"]
     assert mended.pose is not None
-    moved = mended.fit.centres((3, -2)) - read_calibration(wrong).fit.centres((3, -2))
+    moved = mended.fit.centres((3, -2)) - open_calibration(wrong).fit.centres((3, -2))
     np.testing.assert_allclose(moved, summary["lattice_shift_px"], atol=1e-12)
     # The shipped images belong together: nothing has moved, and the tracers are 0.05 mm wide.
     assert np.abs(moved).max() < 0.01
@@ -71,7 +71,7 @@ def test_half_a_millimetre_on_the_recorded_pair(
     dark, off = ("--dark", data / "dark.tif"), tmp_path / "off.h5"
     stills = ("--white", data / "white.tif", "--board", data / "board.tif")
     run("calibrate-snapshot", config, *stills, *dark, "-o", tmp_path / "calibration.h5")
-    right = read_calibration(tmp_path / "calibration.h5")
+    right = open_calibration(tmp_path / "calibration.h5")
     assert right.mid_plane_z_mm is not None
     moved = replace(right.rectification, fit=right.fit.shifted(np.array([0.2, -0.1])))
     write_calibration(off, replace(right, rectification=moved, mid_plane_z_mm=right.mid_plane_z_mm + 0.5), {}, False)

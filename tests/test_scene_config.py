@@ -15,7 +15,7 @@ import tifffile
 from lfpiv_cli.calibration import model
 from lfpiv_cli.console import CONSOLE
 from lfpiv_cli.errors import ConfigError, InputError
-from lfpiv_cli.files.calibration_file import read_calibration, write_calibration
+from lfpiv_cli.files.calibration_file import open_calibration, write_calibration
 from lfpiv_cli.files.config import Config, load_config
 from lfpiv_cli.files.sections import FaceSection
 from lfpiv_cli.files.yaml_nodes import read_heights
@@ -298,7 +298,7 @@ def test_a_calibration_moves_the_scene_and_the_pipe(configured: Callable[[str], 
     pose = ScenePose(np.array([0.0, 0.15, -0.2]), turn, still, still, still, told.scene_fingerprint())
     found = replace(model.calibrate(model.Photographs(), None, model.DataSheet(camera=camera)), scene=pose)
     write_calibration(tmp_path / "refined.h5", found, {}, False)
-    read = read_calibration(tmp_path / "refined.h5")
+    read = open_calibration(tmp_path / "refined.h5")
     assert read.scene is not None
     assert read.summary()["scene_turn_deg"] == turn.tolist()
     config = told.with_scene_of(read)

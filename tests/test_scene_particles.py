@@ -9,8 +9,8 @@ import pytest
 from scipy.spatial import KDTree
 
 from lfpiv_cli.cli.main import cli
+from lfpiv_cli.files.particle_file import open_particles
 from lfpiv_cli.files.particles import read_particles
-from lfpiv_cli.verbs.readers import open_particles
 
 RIG = """\
 camera:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from lfpiv_cli.console import Console
 from lfpiv_cli.errors import ConfigError, InputError, UsageError
-from lfpiv_cli.files.calibration_file import read_calibration
+from lfpiv_cli.files.calibration_file import open_calibration
 from lfpiv_cli.optics.camera import Lattice
 from lfpiv_cli.verbs.calibrate import CalibrateOptions, calibrate_snapshot
 
@@ -69,7 +69,7 @@ def test_small_aperture_gives_the_lattice_and_wide_the_transmission(tmp_path: Pa
     for whites in ([wide, small], [small, wide]):
         origin = calibrated(tmp_path, config(tmp_path), whites)["origin_px"]
         np.testing.assert_allclose(origin, moved.points(moved.nearest(origin)), atol=0.03)
-        transmission = read_calibration(tmp_path / "c.h5").transmission
+        transmission = open_calibration(tmp_path / "c.h5").transmission
         assert transmission is not None
         # pi 6^2 / 14.2^2 of the pixels are lit in the wide picture, a quarter of that in the small one.
         assert np.mean(transmission > 0.5) == pytest.approx(np.pi * 36 / 14.2**2, abs=0.06)
@@ -100,7 +100,7 @@ def test_a_known_focus_needs_no_board(tmp_path: Path, square: Lattice) -> None:
         None,
         True,
     )
-    assert read_calibration(tmp_path / "c.h5").summary() == figures
+    assert open_calibration(tmp_path / "c.h5").summary() == figures
     with pytest.raises(UsageError, match="0 --board and 2 --depth-mm"):
         calibrate_snapshot(rig, tmp_path / "d.h5", replace(options, depth_mm=[0.0, 1.0]), console=QUIET)
     with pytest.raises(UsageError, match="a depth of nan mm"):

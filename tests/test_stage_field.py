@@ -17,7 +17,7 @@ from lfpiv_cli.errors import InputError, UsageError
 from lfpiv_cli.fields.structure import Samples
 from lfpiv_cli.files import vtkhdf
 from lfpiv_cli.files.config import Config, load_config
-from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, TRACKS_FORMAT, Points, read_tracks, write_points
+from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, TRACKS_FORMAT, Points, open_tracks, write_points
 from lfpiv_cli.flow.correlation import SMALLEST_VALID_FRACTION
 from lfpiv_cli.flow.field import MASKED
 from lfpiv_cli.flow.windows import RoundWall
@@ -223,7 +223,7 @@ def test_pressure_needs_a_sequence(tmp_path: Path, rng: np.random.Generator) -> 
 def test_a_pair_has_no_frames(rng: np.random.Generator, tmp_path: Path) -> None:
     write_tracks(tmp_path / "tracks.vtkhdf", rng, 30)
     with pytest.raises(UsageError, match="of a pair"):
-        samples_of_tracks(read_tracks(tmp_path / "tracks.vtkhdf"), 1)
+        samples_of_tracks(open_tracks(tmp_path / "tracks.vtkhdf"), 1)
 
 
 def test_a_sequence_s_samples_are_those_of_its_frame() -> None:

@@ -12,9 +12,9 @@ those under which they are seen, on average.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -139,16 +139,6 @@ class RayFit:
     residual_mm: Floats
     entrance_pupil_mm: float | None = None
     entrance_pupil_sigma_mm: float | None = None
-
-    @classmethod
-    def from_tree(cls, tree: Mapping[str, Any]) -> RayFit:
-        """Return the fit of a dict of its fields, and of its rays' fields.
-
-        Raises
-        ------
-        KeyError, ValueError : something is missing or cannot be
-        """
-        return cls(**(dict(tree) | {"rays": PolynomialRays.from_tree(tree["rays"])}))
 
     def behind_its_pupil(self, camera: Camera) -> Camera:
         """Return a camera with the entrance pupil where the boards show it, if that is another place than it has."""

@@ -1,12 +1,12 @@
-"""A calibration: what a white image and the picture of a board tell about a camera, and how it is stored.
+"""A calibration: what a white image and the picture of a board tell about a camera.
 
 Axes: pixels are (column, row); world axes are those of the raw sensor, z away from the camera from the focal point.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -17,7 +17,7 @@ from lfpiv_cli.arrays import Floats, Singles
 from lfpiv_cli.calibration.board import locate_board
 from lfpiv_cli.calibration.board_pose import BoardGeometry, BoardPose
 from lfpiv_cli.calibration.dlfc import RayFit, fit_rays
-from lfpiv_cli.calibration.lattice import EXPONENTS, LatticeFit, fit_lattice
+from lfpiv_cli.calibration.lattice import LatticeFit, fit_lattice
 from lfpiv_cli.calibration.light_checks import check_residual
 from lfpiv_cli.calibration.rectification import Rectification
 from lfpiv_cli.calibration.sheet import check_pitch, image_distance_mm, sheet_fit
@@ -31,26 +31,12 @@ from lfpiv_cli.calibration.white import (
 )
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.names import Layout
-from lfpiv_cli.optics.camera import Camera, Lattice, refocused
+from lfpiv_cli.optics.camera import Camera, refocused
 from lfpiv_cli.optics.media import Media
 from lfpiv_cli.optics.shapes import ScenePose
 
 # A measured magnification replaces the data sheet's when it differs by more standard errors than chance explains.
 MAGNIFICATION_SIGMAS = 3.0
-# Numbers that the file keeps as they are.
-CARRIED = ("camera_move_mm", "mid_plane_z_mm", "mid_plane_z_sigma_mm", "image_distance_mm", "image_distance_sigma_mm")
-# Shapes of the arrays that the file keeps, None for any length.
-OF_RAYS: Mapping[str, tuple[int | None, ...]] = {"depths_mm": (None,), "reach_mm": (2, 2), "residual_mm": (None, 2)}
-SHAPES: Mapping[str, tuple[int | None, ...]] = {
-    **dict.fromkeys(("indices", "centres_px", "dots_px"), (None, 2)),
-    **dict.fromkeys(("dots_mm", "dots_sigma_mm", "residual_mm"), (None, 3)),
-    **dict.fromkeys(("residual_px", "residual_affine_px", "pitch_sigma_px", "origin_sigma_px", "origin_px"), (2,)),
-    **dict.fromkeys(("tilt_deg", "tilt_sigma_deg", "offset_mm", "offset_sigma_mm"), (2,)),
-    "basis_px": (2, 2),
-    "cubic_px": (len(EXPONENTS), 2),
-}
-# What may not be known.
-UNKNOWN = (*CARRIED, "k1_per_mm2", "k1_sigma_per_mm2", "entrance_pupil_mm", "entrance_pupil_sigma_mm")
 
 
 @dataclass(frozen=True)
@@ -201,72 +187,6 @@ class Calibration:
             "dlfc_sightings": rays.sightings if rays else None,
             "dlfc_residual_mm": np.sqrt(np.mean(rays.residual_mm**2, axis=0)).tolist() if rays else None,
         } | ({} if self.scene is None else self.scene.summary())
-
-    def to_tree(self) -> dict[str, Any]:
-        """Return everything as a nested dict of arrays, numbers, strings and None."""
-        fit = asdict(self.fit)
-        lattice = fit.pop("lattice_px")
-        fit |= {"layout": lattice["layout"], "origin_px": lattice["origin"], "basis_px": lattice["basis"]}
-        return {
-            "image_shape": np.array(self.image_shape, dtype=np.int64),
-            "lattice": fit | {"cubic_used": int(self.fit.cubic_used)},
-            "transmission": self.transmission,
-            "board": asdict(self.pose) if self.pose else None,
-            "dlfc": asdict(self.ray_fit) if self.ray_fit else None,
-            "scene": asdict(self.scene) if self.scene else None,
-            "mid_plane_given": 1 if self.mid_plane_given else None,
-        } | {name: getattr(self, name) for name in CARRIED}
-
-    @classmethod
-    def from_tree(cls, tree: Mapping[str, Any]) -> Calibration:
-        """Return the calibration that `to_tree` took apart.
-
-        Raises
-        ------
-        InputError : when something is missing, or of another shape
-        """
-        try:
-            rows, columns = (int(n) for n in tree["image_shape"])
-            fit, rays = dict(tree["lattice"]), tree.get("dlfc") or {}
-            _ensure_shapes({name: value for name, value in fit.items() if name != "layout"})
-            _ensure_shapes(tree.get("board") or {})
-            _ensure_shapes({name: value for name, value in rays.items() if name != "rays"}, OF_RAYS)
-            _ensure_shapes({name: tree.get(name) for name in CARRIED})
-            if tree.get("transmission") is not None:
-                _ensure_shapes({"transmission": tree["transmission"]}, {"transmission": (rows, columns)})
-                if not np.isfinite(tree["transmission"]).all():
-                    raise ValueError("a transmission is not a finite number")
-            lattice = Lattice(fit.pop("origin_px"), fit.pop("basis_px"), fit.pop("layout"))
-            fit["cubic_used"] = bool(fit["cubic_used"])
-            return cls(
-                Rectification(LatticeFit(lattice_px=lattice, **fit), (rows, columns)),
-                tree.get("transmission"),
-                BoardPose(**tree["board"]) if tree.get("board") else None,
-                ray_fit=RayFit.from_tree(rays) if rays else None,
-                mid_plane_given=bool(tree.get("mid_plane_given")),
-                scene=ScenePose.from_tree(tree["scene"]) if tree.get("scene") else None,
-                **{name: tree.get(name) for name in CARRIED},
-            )
-        except (KeyError, TypeError, ValueError, AttributeError) as error:
-            raise InputError(f"the calibration is not complete ({error}); make it again") from error
-
-
-def _ensure_shapes(tree: Mapping[str, Any], shapes: Mapping[str, tuple[int | None, ...]] = SHAPES) -> None:
-    """Refuse numbers of other shapes than these, single ones where there is none; groups and texts are no numbers.
-
-    Raises
-    ------
-    ValueError
-    """
-    for name, value in tree.items():
-        if value is None and name in UNKNOWN:
-            continue
-        found, expected = np.asarray(value), shapes.get(name, ())
-        fits = found.ndim == len(expected) and all(n in (None, m) for n, m in zip(expected, found.shape, strict=True))
-        if not fits or found.dtype.kind not in "biuf":
-            kind = f"numbers of the shape {found.shape}" if found.dtype.kind in "biuf" else "no numbers"
-            words = " x ".join("n" if n is None else str(n) for n in expected)
-            raise ValueError(f"{name} holds {kind}, expected {words + ' numbers' if expected else 'a number'}")
 
 
 @dataclass(frozen=True, eq=False)

@@ -162,7 +162,7 @@ def raw_option(command: Callable[..., Any]) -> Callable[..., Any]:
     def run(raw: str | None = None, **arguments: Any) -> Any:
         if raw is None:
             return command(**arguments)
-        from lfpiv_cli.files.recordings.blocks import parse_layout, with_layout
+        from lfpiv_cli.files.recordings.recording import parse_layout, with_layout
 
         parse_layout(raw)
         if arguments.get("watch"):

@@ -209,14 +209,16 @@ def shown(path: Path) -> str:
     return text if len(text) <= LONGEST_SHOWN else f"...{text[-LONGEST_SHOWN:]}"
 
 
-def write_atomically(
-    target: Path, write: Callable[[Path], object], *, overwrite: bool, check: Callable[[Path], object] | None = None
-) -> None:
+@contextmanager
+def written_atomically(
+    target: Path, *, overwrite: bool, check: Callable[[Path], object] | None = None
+) -> Iterator[Path]:
     """Write a file so that it appears under its name only when it is complete.
+
+    Yields the temporary file to fill, which exists, is empty and has the target's suffix.
 
     Parameters
     ----------
-    write : fills the temporary file that it is given, which exists, is empty and has the target's suffix
     check : reads the finished temporary file back and raises `InputError` where it is not what was meant
 
     Raises
@@ -231,7 +233,7 @@ def write_atomically(
         temporary = target.with_name(f".{target.stem[:KEPT_CHARACTERS]}.{begun_by}.partial{target.suffix}")
         try:
             os.close(create_alone(temporary))
-            write(temporary)
+            yield temporary
             if check is not None:
                 try:
                     check(temporary)
@@ -268,7 +270,8 @@ def write_json(path: Path, value: Mapping[str, Any], overwrite: bool) -> None:
 def write_text(path: Path, text: str, overwrite: bool) -> None:
     """Write text in UTF-8; names of files that are no UTF-8 keep their bytes."""
     content = text.encode("utf-8", "surrogateescape")
-    write_atomically(path, lambda temporary: temporary.write_bytes(content), overwrite=overwrite)
+    with written_atomically(path, overwrite=overwrite) as temporary:
+        temporary.write_bytes(content)
 
 
 def without_nan(value: Any) -> Any:

@@ -6,7 +6,7 @@ import re
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from enum import Enum, auto
+from enum import IntEnum, auto
 from pathlib import Path
 from typing import Any
 
@@ -81,21 +81,17 @@ class Target:
         return self.make_record()
 
 
-class State(Enum):
-    """What is there in a target's place.
+class State(IntEnum):
+    """What is there in a target's place, by how much it keeps a target of several files from being complete.
 
-    Nothing, the very result, one that differs in nothing that it depends on, a broken file, or something else.
+    The very result, one that differs in nothing that it depends on, nothing, a broken file, or something else.
     """
 
-    MISSING = auto()
     COMPLETE = auto()
     BEARS_ALIKE = auto()
+    MISSING = auto()
     BROKEN = auto()
     OTHER = auto()
-
-
-# What keeps a target of several files from being complete, the worst last.
-WORST_LAST = (State.COMPLETE, State.BEARS_ALIKE, State.MISSING, State.BROKEN, State.OTHER)
 
 
 def frames_of(paths: Iterable[Path], keep_going: bool = False) -> list[Frame]:
@@ -169,7 +165,7 @@ def state_of(target: Target) -> State:
         else:
             alike = carried is not None and bear_alike(carried, made)
             states.append(State.BEARS_ALIKE if alike else State.OTHER)
-    return max(states, key=WORST_LAST.index)
+    return max(states)
 
 
 def pending(
@@ -254,7 +250,18 @@ def results_seen(paths: Sequence[Path]) -> list[Seen]:
 
     Their own names count where these are not known, or are the same for different images.
     """
-    sources = [_source(path) for path in paths]
+
+    def source_of(path: Path) -> tuple[str, str, int] | None:
+        """Return its image: the file's name without suffix and SHA-256, and the page; None where that is not known."""
+        try:
+            made = earlier_record(path) or {}
+            image, page = made["inputs"]["image"], PAGE.search(made["command"])
+            stem = split_part(Path(image["name"]))[0].stem
+            return page and (stem, image["sha256"], int(page[1]))
+        except (InputError, KeyError, TypeError):
+            return None  # what is broken is told where its turn comes
+
+    sources = [source_of(path) for path in paths]
     own = [Seen(str(path), path.stem, path.with_suffix("").as_posix()) for path in paths]
     pages: dict[str, set[int]] = defaultdict(set)
     for source in sources:
@@ -270,17 +277,3 @@ def results_seen(paths: Sequence[Path]) -> list[Seen]:
     if len({(each.stem, each.page) for each in seen}) == len({each.image or each.path for each in seen}):
         return seen
     return [replace(each, image=other.image) for each, other in zip(own, seen, strict=True)]
-
-
-def _source(path: Path) -> tuple[str, str, int] | None:
-    """Return the image that a result is made from: its file's name without suffix and SHA-256, and the page.
-
-    None where its record does not say, or the file is broken.
-    """
-    try:
-        made = earlier_record(path) or {}
-        image, page = made["inputs"]["image"], PAGE.search(made["command"])
-        stem = split_part(Path(image["name"]))[0].stem
-        return page and (stem, image["sha256"], int(page[1]))
-    except (InputError, KeyError, TypeError):
-        return None  # what is broken is told where its turn comes

@@ -11,7 +11,7 @@ from pydantic import ValidationError
 
 from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.files.sections import CylinderFace, HeightMapFace, scene_of
-from lfpiv_cli.files.sections_simulated import Sections, SimulationSection
+from lfpiv_cli.files.sections_work import Sections, SimulationSection
 from lfpiv_cli.files.yaml_nodes import Document, KeyPath, Problem, key_name, place_of, problem_of, report
 from lfpiv_cli.flow.windows import RoundWall
 from lfpiv_cli.notice import written
@@ -81,11 +81,11 @@ def _twice(place: KeyPath, given: float, expected: float, what: str) -> Found:
         yield place, f"is {given:g}, but {what} is {expected:g}"
 
 
-def _lens(sections: Sections) -> Found:
-    """Yield what is given twice and differs: S_i = F_m (P - M) and the f-numbers."""
+def _camera(sections: Sections) -> Found:
+    """Yield what is given twice and differs (S_i = F_m (P - M), f-numbers), and lens images nobody could tell apart."""
     if sections.camera is None:
         return
-    lens, microlenses = sections.camera.main_lens, sections.camera.microlenses
+    lens, microlenses, sensor = sections.camera.main_lens, sections.camera.microlenses, sections.camera.sensor
     if lens is not None:
         place = ("camera", "main_lens")
         focal_length = lens.known_focal_length_mm
@@ -111,22 +111,15 @@ def _lens(sections: Sections) -> Found:
     if microlenses.f_number and microlenses.focal_length_mm:
         place, expected = ("camera", "microlenses"), microlenses.focal_length_mm / microlenses.pitch_mm
         yield from _twice((*place, "f_number"), microlenses.f_number, expected, "focal_length_mm / pitch_mm")
-
-
-def _lens_images(sections: Sections) -> Found:
-    """Yield pixels that cannot tell lens images, a sensor far out of their focus, and too wide an aperture."""
-    section = sections.camera
-    if section is None:
-        return
-    sensor, pitch_mm = section.sensor, section.microlenses.pitch_mm
+    pitch_mm = microlenses.pitch_mm
     pitch_px = pitch_mm * 1e3 / sensor.pixel_um
     if not FEWEST_PIXELS_A_LENS <= pitch_px <= MOST_PIXELS_A_LENS:  # most often a slip in the unit
         text = f"lens images would be {written(pitch_px, 4)} px apart (pitch_mm is {pitch_mm:g}), expected "
         text += f"{FEWEST_PIXELS_A_LENS:g} to {MOST_PIXELS_A_LENS:g}: pixels in um, the pitch in mm"
         yield ("camera", "sensor", "pixel_um"), f"is {sensor.pixel_um:g}: {text}"
-    camera = section.model()
-    for place, text in () if camera is None else lens_image_faults(camera):
-        yield ("camera", *place), text
+    camera = sections.camera.model()
+    for inside, text in () if camera is None else lens_image_faults(camera):
+        yield ("camera", *inside), text
 
 
 def lens_image_faults(camera: Camera) -> Found:
@@ -151,17 +144,19 @@ def _volume(sections: Sections) -> Found:
     volume = sections.volume
     if volume is None:
         return
-    place = ("volume",)
     if volume.size_mm is not None:
         for name in ("shape_xyz", "voxel_mm"):
             if getattr(volume, name) is not None:
-                yield (*place, name), "contradicts size_mm, which leaves the voxels to the program"
+                yield ("volume", name), "contradicts size_mm, which leaves the voxels to the program"
         if sections.camera is None or sections.camera.missing is not None or sections.media is None:
-            yield (*place, "size_mm"), "needs the sections media and camera, with all of its main lens, for the voxels"
+            yield (
+                ("volume", "size_mm"),
+                "needs the sections media and camera, with all of its main lens, for the voxels",
+            )
     elif volume.shape_xyz is None or volume.voxel_mm is None:
-        yield place, "needs shape_xyz and voxel_mm, or size_mm"
+        yield ("volume",), "needs shape_xyz and voxel_mm, or size_mm"
     if volume.reference == "mid_plane" and sections.channel is None:
-        yield (*place, "reference"), "is mid_plane, which needs the section channel"
+        yield ("volume", "reference"), "is mid_plane, which needs the section channel"
 
 
 def _board(sections: Sections) -> Found:
@@ -211,18 +206,17 @@ def _scene(sections: Sections) -> Found:
     if scene[last].index_behind(media) != media.fluid:
         yield ("scene", last, "behind"), f"is {scene[last].behind}, expected fluid behind the last face"
         return
-    missed = False
+    faults: list[tuple[KeyPath, str]] = []
     for k, section in enumerate(scene):
         if isinstance(section, HeightMapFace) and (section.file is None) == (section.heights_mm is None):
-            yield ("scene", k), "expected a file of heights, or heights_mm, and not both"
-            missed = True
+            faults.append((("scene", k), "expected a file of heights, or heights_mm, and not both"))
             continue
         try:
             section.model(media).surface.shape()
         except ConfigError as error:
-            yield ("scene", k), str(error)
-            missed = True
-    if missed:
+            faults.append((("scene", k), str(error)))
+    yield from faults
+    if faults:
         return
     try:
         space = scene_of(scene, media)
@@ -232,12 +226,9 @@ def _scene(sections: Sections) -> Found:
     except ConfigError as error:
         yield ("scene",), str(error)
         return
-    yield from _pipe(sections)
 
-
-def _pipe(sections: Sections) -> Found:
-    """Yield a pipe's wall that is not the cylinder in front of the fluid; its depth is known from the focal point."""
-    pipe, face = sections.pipe, sections.scene[-1] if sections.scene else None
+    # A pipe's wall is the cylinder in front of the fluid; its depth is known from the focal point.
+    pipe, face = sections.pipe, scene[-1]
     if pipe is None or not isinstance(face, CylinderFace):
         return
     yield from _twice(("pipe", "radius_mm"), pipe.radius_mm, face.radius_mm, "that of the last face in scene")
@@ -334,4 +325,4 @@ def _object_space(sections: Sections) -> Found:
 
 
 # All that several keys can say together.
-FAULTS = (_lens, _lens_images, _volume, _board, _walls, _scene, _processing, _rays, _object_space)
+FAULTS = (_camera, _volume, _board, _walls, _scene, _processing, _rays, _object_space)

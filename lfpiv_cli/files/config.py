@@ -27,7 +27,7 @@ from lfpiv_cli.files.sections import (
     VolumeSection,
     scene_of,
 )
-from lfpiv_cli.files.sections_simulated import (
+from lfpiv_cli.files.sections_work import (
     CorrelationSection,
     FlowSection,
     ReconstructionSection,
@@ -271,8 +271,7 @@ class Config:
     def grid(self, reference: Reference = FOCAL_POINT) -> Grid:
         """Return the volume's grid: z as in the config, or from the focal point where its reference is given."""
         chosen = self.volume.size_mm is not None
-        scale = self.camera_model().scale(self.media_model()) if chosen else None
-        return self.volume.grid(scale, reference)
+        return self.volume.grid(self.camera_model().scale(self.media_model()) if chosen else None, reference)
 
     def rig(self) -> Rig:
         """Return what must be known to read the picture of a board; a chessboard's points are its inner corners."""
@@ -387,15 +386,27 @@ class Config:
         return section
 
 
-def load_config(path: Path) -> Config:
-    """Read a configuration, and the heights of faces in files beside it.
+def load_rig(path: Path | str) -> Config:
+    """Read a rig: the YAML file of camera, media, volume and settings that the commands take as CONFIG.
+
+    Heights of faces are read from the files beside it.
+
+    Returns
+    -------
+    Config
+        With every default filled in; `resolved()` gives it as plain data.
 
     Raises
     ------
-    ConfigError : anything in it is malformed, unknown, contradictory or impossible; all errors at once
-    InputError : the file is missing or not a file
+    ConfigError
+        Anything in it is malformed, unknown, contradictory or impossible; all errors at once, each with its line.
+    InputError
+        The file is missing or not a file.
     """
-    return Config(validated(read_rig(path), str(path)), str(path))
+    return Config(validated(read_rig(Path(path)), str(path)), str(path))
+
+
+load_config = load_rig
 
 
 def carried_config(record: Mapping[str, Any], source: Path | str) -> Config:

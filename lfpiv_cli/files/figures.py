@@ -13,13 +13,12 @@ from numpy.typing import NDArray
 
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.files import calibration_file, images, vtkhdf
-from lfpiv_cli.files.calibration_file import read_calibration
-from lfpiv_cli.files.hdf5 import RESERVED, format_of, from_attribute, open_h5, read_provenance
-from lfpiv_cli.files.hdf5_checks import member
+from lfpiv_cli.files.calibration_file import open_calibration
+from lfpiv_cli.files.hdf5 import RESERVED, format_of, from_attribute, member, open_h5, read_provenance
 from lfpiv_cli.files.images import frames
 from lfpiv_cli.files.inputs import ensure_regular_file, split_page, split_part
-from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, TRACKS_FORMAT, TRAJECTORIES_FORMAT, read_points, read_tracks
-from lfpiv_cli.files.recordings import stack
+from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, TRACKS_FORMAT, TRAJECTORIES_FORMAT, open_tracks, read_points
+from lfpiv_cli.files.recordings.formats import HDF5_START
 from lfpiv_cli.flow.field import MM_TO_M, REJECTED, VALID, derived_fields
 
 # What `info` tells of a file of frames.
@@ -64,7 +63,7 @@ def is_recording(path: Path) -> bool:
         kind = images.format_of(file, split_page(part)[0])
     except InputError:
         return False
-    if kind.starts != (stack.START,) or part is not None:
+    if kind.starts != (HDF5_START,) or part is not None:
         return True
     with open_h5(file) as content:
         return "format" not in content.attrs
@@ -166,7 +165,7 @@ def _range(values: NDArray[np.float64]) -> list[float] | None:
 
 
 def _of_tracks(path: Path) -> dict[str, Any]:
-    tracks = read_tracks(path)
+    tracks = open_tracks(path)
     arrays, places = tracks.arrays, tracks.position_mm
     found: dict[str, Any] = {"tracks": len(places)}
     if "track" in arrays:
@@ -206,6 +205,6 @@ FIGURES: dict[str, Callable[[Path], dict[str, Any]]] = {
     TRACKS_FORMAT: _of_tracks,
     TRAJECTORIES_FORMAT: _of_tracks,
     calibration_file.FORMAT: lambda path: {
-        name: value for name, value in read_calibration(path).summary().items() if value is not None
+        name: value for name, value in open_calibration(path).summary().items() if value is not None
     },
 }

@@ -17,10 +17,10 @@ import tifffile
 from numpy.typing import NDArray
 
 from lfpiv_cli.errors import InputError, UsageError
-from lfpiv_cli.files.atomic import write_atomically
+from lfpiv_cli.files.atomic import written_atomically
 from lfpiv_cli.files.inputs import ensure_regular_file, opened, split_page, split_part
-from lfpiv_cli.files.recordings import blocks, cameras, stack, tiff
-from lfpiv_cli.files.recordings.recording import Image, Recording, Shape
+from lfpiv_cli.files.recordings import cameras, formats
+from lfpiv_cli.files.recordings.recording import LOOKS_LAID_OUT, SUFFIXES, Image, Recording, Shape, raw_frames
 from lfpiv_cli.notice import written
 
 # Which formats of frames there are, how each is recognised, and what reads it.
@@ -51,11 +51,11 @@ class Format:
     in_folders: bool = True
 
 
-RAW = Format("raw", blocks.frames, suffixes=blocks.SUFFIXES, frames_of=blocks.frames)
+RAW = Format("raw", raw_frames, suffixes=SUFFIXES, frames_of=raw_frames)
 FORMATS = (
-    Format("TIFF", tiff.frames, starts=tiff.STARTS),
-    Format("PNG", tiff.png_frames, starts=(tiff.PNG_START,)),
-    Format("HDF5", stack.frames, starts=(stack.START,), frames_of=stack.frames, in_folders=False),
+    Format("TIFF", formats.tiff_frames, starts=formats.TIFF_STARTS),
+    Format("PNG", formats.png_frames, starts=(formats.PNG_START,)),
+    Format("HDF5", formats.hdf5_frames, starts=(formats.HDF5_START,), frames_of=formats.hdf5_frames, in_folders=False),
     Format("Phantom cine", cameras.cine_frames, starts=(cameras.CINE_START,)),
     Format("Norpix seq", cameras.seq_frames, starts=(cameras.SEQ_START,)),
     Format("Photron mraw", cameras.mraw_frames, suffixes=(cameras.MRAW_SUFFIX,), beside=cameras.header_beside),
@@ -97,7 +97,7 @@ def format_of(path: Path, part: str | None = None) -> Format:
     found = found or [each for each in FORMATS if each.starts and start.startswith(each.starts)]
     if found:
         return found[0]
-    if part is not None and blocks.LOOKS_LAID_OUT.match(part):
+    if part is not None and LOOKS_LAID_OUT.match(part):
         return RAW
     *others, last = (each.name for each in FORMATS if each.name not in ("TIFF", "PNG"))
     raise InputError(f"{path}: is neither a TIFF nor a PNG image, nor a recording of {', '.join(others)} or {last}")
@@ -153,7 +153,32 @@ def count_pages(path: Path) -> int:
     return frames(path).pages
 
 
-def read_image(path: Path, shape: Shape | None = None) -> Image:
+def read_image(path: Path | str, page: int = 0, shape: Shape | None = None) -> Image:
+    """Read an image of a TIFF or PNG file or of a camera's recording, or one page of a sequence.
+
+    `FILE.h5:/PATH` names a dataset, `FILE.raw:LAYOUT` the layout of frames without a header.
+
+    Parameters
+    ----------
+    shape : the sensor's (rows, columns), where it is known
+
+    Returns
+    -------
+    (rows, columns) float32
+        Counts.
+
+    Raises
+    ------
+    InputError
+        The file is missing or broken, in colour, of another size, or has no such page.
+    """
+    recording = frames(Path(path))
+    if not 0 <= page < recording.pages:
+        raise InputError(f"{path}: has no page {page}, it holds {recording.pages}")
+    return recording.read_page(page, shape)
+
+
+def read_single(path: Path, shape: Shape | None = None) -> Image:
     """Read the only frame of a file, shape (rows, columns), in counts.
 
     Parameters
@@ -162,12 +187,12 @@ def read_image(path: Path, shape: Shape | None = None) -> Image:
 
     Raises
     ------
-    InputError : the file is broken, holds several frames, is in colour, or has another size
+    InputError : as `read_image`, and where the file holds several frames
     """
     pages = count_pages(path)
     if pages != 1:
         raise InputError(f"{path}: holds {pages} pages, expected a single image; {path}:page=0 is the first one")
-    return read_page(path, 0, shape)
+    return read_image(path, 0, shape)
 
 
 def read_reference(path: Path, shape: Shape | None = None) -> Image:
@@ -177,7 +202,7 @@ def read_reference(path: Path, shape: Shape | None = None) -> Image:
     ------
     InputError : as `read_image`, and where a pixel is not a number, or no camera could have it
     """
-    image = read_image(path, shape)
+    image = read_single(path, shape)
     bad = int(np.count_nonzero(~(np.abs(image) <= MOST_COUNTS)))
     if bad:
         raise InputError(
@@ -186,23 +211,13 @@ def read_reference(path: Path, shape: Shape | None = None) -> Image:
     return image
 
 
-def read_page(path: Path, page: int, shape: Shape | None = None) -> Image:
-    """Read frame `page`, counted from 0: see `read_image`."""
-    recording = frames(path)
-    if not 0 <= page < recording.pages:
-        raise InputError(f"{path}: has no page {page}, it holds {recording.pages}")
-    return recording.read_page(page, shape)
-
-
 def write_tiff(path: Path, array: NDArray[Any], overwrite: bool) -> None:
     """Write an image (rows, columns) of type uint8 or uint16, packed without loss and without time stamps."""
     if array.dtype not in (np.uint8, np.uint16, np.float32) or array.ndim != 2:
         raise TypeError(f"images are uint8, uint16 or float32 (rows, columns), not {array.dtype} {array.shape}")
-
     kept = {"compression": "zlib", "predictor": array.dtype != np.float32, "metadata": None, "software": False}
-    write_atomically(
-        path,
-        lambda temporary: tifffile.imwrite(temporary, array, photometric="minisblack", **kept),
-        overwrite=overwrite,
-        check=lambda temporary: tiff.frames(temporary).read_page(0, (array.shape[0], array.shape[1])),
-    )
+    shape = (array.shape[0], array.shape[1])
+    with written_atomically(
+        path, overwrite=overwrite, check=lambda made: formats.tiff_frames(made).read_page(0, shape)
+    ) as temporary:
+        tifffile.imwrite(temporary, array, photometric="minisblack", **kept)

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from lfpiv_cli.errors import UsageError
-from lfpiv_cli.files.atomic import write_atomically, write_text
+from lfpiv_cli.files.atomic import write_text, written_atomically
 from lfpiv_cli.files.inputs import content_of
 
 if TYPE_CHECKING:
@@ -34,23 +34,20 @@ def ensure_drawing() -> None:
 
 def write_picture(path: Path, figure: Figure, overwrite: bool) -> None:
     """Write a figure as PNG; without time stamps, so that the same figure gives the same bytes."""
-    write_atomically(
-        path,
-        lambda target: figure.savefig(target, format="png", dpi=DOTS_PER_INCH, metadata={"Software": None}),
-        overwrite=overwrite,
-    )
+    with written_atomically(path, overwrite=overwrite) as target:
+        figure.savefig(target, format="png", dpi=DOTS_PER_INCH, metadata={"Software": None})
 
 
 def write_pdf(path: Path, figures: Iterable[Figure], overwrite: bool) -> None:
     """Write figures as the pages of a PDF; without time stamps, so that the same figures give the same bytes."""
     from matplotlib.backends.backend_pdf import PdfPages
 
-    def save(target: Path) -> None:
-        with PdfPages(target, metadata={"CreationDate": None, "Creator": None, "Producer": None}) as pages:
-            for figure in figures:
-                pages.savefig(figure)
-
-    write_atomically(path, save, overwrite=overwrite)
+    with (
+        written_atomically(path, overwrite=overwrite) as target,
+        PdfPages(target, metadata={"CreationDate": None, "Creator": None, "Producer": None}) as pages,
+    ):
+        for figure in figures:
+            pages.savefig(figure)
 
 
 TEMPLATES = Path(__file__).with_name("templates")

@@ -16,7 +16,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
-from types import TracebackType
 from typing import Any, TypeAlias
 
 import h5py
@@ -24,8 +23,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lfpiv_cli.errors import InputError, OutputError
-from lfpiv_cli.files.hdf5 import create, ensure_format, format_of, open_h5, read_array, write_array, write_rows
-from lfpiv_cli.files.hdf5_checks import array_member
+from lfpiv_cli.files.hdf5 import (
+    array_member,
+    created,
+    format_of,
+    open_h5,
+    read_array,
+    write_array,
+    write_rows,
+)
 from lfpiv_cli.files.inputs import reason
 from lfpiv_cli.files.vtkhdf import create_vtk_group, read_root, write_root
 from lfpiv_cli.reference import Reference
@@ -70,9 +76,7 @@ class StoredTracks:
         """Return itself."""
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Remove the file."""
         self._file.close()
 
@@ -254,7 +258,14 @@ def write_points(path: Path, format_name: str, points: PointRows, *, overwrite: 
         if set(points.arrays) != set(units) or any(len(array) != points.count for array in points.arrays.values()):
             raise ValueError(f"{format_name} has the arrays {sorted(units)} of {points.count} rows each")
 
-    def fill(file: h5py.File) -> None:
+    def check(temporary: Path) -> None:
+        with _opened(temporary, format_name) as (file, datasets):
+            read_root(file)
+            for name, dataset in datasets.items():
+                for begin in range(0, len(dataset), CHECKED_ROWS):
+                    _ensure_finite(temporary, name, dataset[begin : begin + CHECKED_ROWS], len(dataset))
+
+    with created(path, overwrite=overwrite, check=check) as file:
         write_root(file, format_name, FORMAT_VERSION, points.reference, points.attributes, points.provenance)
         vtk = create_vtk_group(file, None)
         vtk["Points"] = write_rows(file, POSITION, points.count, points.rows(POSITION), "mm")
@@ -275,15 +286,6 @@ def write_points(path: Path, format_name: str, points: PointRows, *, overwrite: 
         data = vtk.create_group("PointData")
         for name, unit in units.items():
             data[name] = write_rows(file, name, points.count, points.rows(name), unit)
-
-    def check(temporary: Path) -> None:
-        with _opened(temporary, format_name) as (file, datasets):
-            read_root(file)
-            for name, dataset in datasets.items():
-                for begin in range(0, len(dataset), CHECKED_ROWS):
-                    _ensure_finite(temporary, name, dataset[begin : begin + CHECKED_ROWS], len(dataset))
-
-    create(path, fill, overwrite=overwrite, check=check)
 
 
 def units_of(format_name: str, names: Container[str]) -> dict[str, str]:
@@ -312,8 +314,7 @@ def read_points(path: Path | str, format_name: str) -> Points:
 @contextmanager
 def _opened(path: Path, format_name: str) -> Iterator[tuple[h5py.File, dict[str, h5py.Dataset]]]:
     """Open a file of points; its arrays, positions first, have as many rows each."""
-    with open_h5(path) as file:
-        ensure_format(path, file, format_name, (FORMAT_VERSION,))
+    with open_h5(path, format_name, FORMAT_VERSION) as file:
         names = [POSITION, *units_of(format_name, file)]
         datasets = {name: array_member(file, name) for name in names}
         shape = datasets[POSITION].shape
@@ -332,8 +333,35 @@ def _ensure_finite(path: Path, name: str, rows: NDArray[Any], count: int) -> Non
         raise InputError(NOT_ONE_VALUE.format(path, name, count))
 
 
-def read_tracks(path: Path | str) -> Points:
-    """Read tracks, of two frames or of a sequence."""
+def open_particles(path: Path | str) -> Points:
+    """Read the particles of a frame.
+
+    Returns
+    -------
+    Points
+        As `find_particles` gives them.
+
+    Raises
+    ------
+    InputError
+        The file is missing, broken, or of another format or version.
+    """
+    return read_points(path, PARTICLES_FORMAT)
+
+
+def open_tracks(path: Path | str) -> Points:
+    """Read the tracks of two frames or of a sequence.
+
+    Returns
+    -------
+    Points
+        As the `points` that `track` gives.
+
+    Raises
+    ------
+    InputError
+        The file is missing, broken, or of another format or version.
+    """
     is_sequence = format_of(Path(path)) == TRAJECTORIES_FORMAT
     return read_points(path, TRAJECTORIES_FORMAT if is_sequence else TRACKS_FORMAT)
 

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lfpiv_cli.errors import InputError
-from lfpiv_cli.files.atomic import write_atomically
+from lfpiv_cli.files.atomic import written_atomically
 from lfpiv_cli.files.inputs import ensure_regular_file, reason
 from lfpiv_cli.notice import written
 
@@ -135,9 +135,5 @@ def write_particles(path: Path, particles: Particles, overwrite: bool) -> None:
         "frame_brightness": particles.frame_brightness,
     }
     known: dict[str, Any] = {name: array.astype(np.float32) for name, array in arrays.items() if array is not None}
-
-    def save(target: Path) -> None:
-        with open(target, "wb") as file:
-            np.savez_compressed(file, **known)
-
-    write_atomically(path, save, overwrite=overwrite)
+    with written_atomically(path, overwrite=overwrite) as target, open(target, "wb") as file:
+        np.savez_compressed(file, **known)

@@ -138,10 +138,14 @@ def also_used_as(made: Mapping[str, Any], role: str) -> str | None:
 
     Of several inputs of a role the names end in a number: `image`, `image_2`.
     """
-    asked = _file_and_part(made["inputs"][role])
+
+    def identity(given: Mapping[str, str]) -> tuple[str, str | None]:
+        return given["sha256"], split_part(Path(given["name"]))[1]  # the content, and which part of it is meant
+
+    asked = identity(made["inputs"][role])
     for each in (made, *made["made_from"].values()):
         for name, given in each["inputs"].items():
-            if _file_and_part(given) == asked and name.partition("_")[0] != role:
+            if identity(given) == asked and name.partition("_")[0] != role:
                 return f"{name} of {each['command'].split()[0]}"
     return None
 
@@ -174,11 +178,6 @@ def even_step_s(steps_s: Sequence[float | None], names: Sequence[str]) -> float 
     if max(told) - min(told) > UNEVEN * mean_s:
         raise InputError(f"{span} are {min(told):g} to {max(told):g} s apart, expected even steps; give --dt-s")
     return mean_s
-
-
-def _file_and_part(given: Mapping[str, str]) -> tuple[str, str | None]:
-    """Return what tells an input of a record from others: the file's content, and which part of it is meant."""
-    return given["sha256"], split_part(Path(given["name"]))[1]
 
 
 def calibrated_with(made: Mapping[str, Any]) -> str | None:

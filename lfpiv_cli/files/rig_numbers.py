@@ -16,7 +16,7 @@ import numpy as np
 
 from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.files.sections import LATERAL_VOXELS_PER_MICROLENS, UM_TO_MM
-from lfpiv_cli.files.sections_simulated import CorrelationSection, Sections
+from lfpiv_cli.files.sections_work import CorrelationSection, Sections
 from lfpiv_cli.notice import written
 from lfpiv_cli.optics.camera import Camera, Lattice
 from lfpiv_cli.optics.line_responses import USUAL_DIFFUSION_PX

@@ -19,9 +19,10 @@ from numpy.typing import NDArray
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.files.hdf5 import (
     RESERVED,
-    create,
-    ensure_format,
+    array_member,
+    created,
     from_attribute,
+    member,
     open_h5,
     read_array,
     read_provenance,
@@ -29,7 +30,6 @@ from lfpiv_cli.files.hdf5 import (
     write_array,
     write_header,
 )
-from lfpiv_cli.files.hdf5_checks import array_member, member
 from lfpiv_cli.flow.field import REJECTED, VectorField
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.reference import Reference
@@ -172,12 +172,9 @@ def write_volume(
     """
     if array_zyx.shape != grid.shape_zyx:
         raise ValueError(f"the array's shape is {array_zyx.shape}, the grid's {grid.shape_zyx}")
-
-    def fill(file: h5py.File) -> None:
+    with created(path, overwrite=overwrite, check=open_volume) as file:
         write_root(file, VOLUME_FORMAT, FORMAT_VERSION, reference, attributes, provenance)
         _write_on_grid(file, grid, {"intensity": (array_zyx.astype(np.float32), "1")})
-
-    create(path, fill, overwrite=overwrite, check=open_volume)
 
 
 def open_volume(path: Path | str) -> Volume:
@@ -188,8 +185,7 @@ def open_volume(path: Path | str) -> Volume:
     InputError : the file is missing, broken, not a volume, or holds values that are not finite
     """
     path = Path(path)
-    with open_h5(path) as file:
-        ensure_format(path, file, VOLUME_FORMAT, (FORMAT_VERSION,))
+    with open_h5(path, VOLUME_FORMAT, FORMAT_VERSION) as file:
         grid = grid_in(file)
         array = read_on_grid(path, file, grid, {"intensity": False})["intensity"]
         root = read_root(file)
@@ -215,8 +211,7 @@ def write_vectors(
     reference : the origin that the grid's z counts from
     extra : arrays (nz, ny, nx) or (nz, ny, nx, 3) to store besides, by their name, with their unit
     """
-
-    def fill(file: h5py.File) -> None:
+    with created(path, overwrite=overwrite, check=open_vectors) as file:
         write_root(file, VECTORS_FORMAT, FORMAT_VERSION, reference, {}, provenance)
         file.attrs["voxel_mm"] = np.asarray(field.voxel_mm, dtype=np.float64)
         file.attrs["window_voxel"] = np.asarray(field.window_voxel, dtype=np.int64)
@@ -229,8 +224,6 @@ def write_vectors(
             arrays[UNCERTAINTY] = (field.uncertainty_voxel, "voxel")
         _write_on_grid(file, field.grid, arrays | dict(extra or {}))
 
-    create(path, fill, overwrite=overwrite, check=open_vectors)
-
 
 def open_vectors(path: Path | str) -> VectorField:
     """Read a vector field.
@@ -240,8 +233,7 @@ def open_vectors(path: Path | str) -> VectorField:
     InputError : the file is missing, broken, not a vector field, or a vector counts as valid and is not finite
     """
     path = Path(path)
-    with open_h5(path) as file:
-        ensure_format(path, file, VECTORS_FORMAT, (FORMAT_VERSION,))
+    with open_h5(path, VECTORS_FORMAT, FORMAT_VERSION) as file:
         grid = grid_in(file)
         components = {name: vector for name, (_, vector) in VECTOR_ARRAYS.items()}
         arrays = read_on_grid(path, file, grid, components | ({UNCERTAINTY: True} if UNCERTAINTY in file else {}))

@@ -19,13 +19,14 @@ says how many voxels lie outside the fluid. Weights of earlier versions are refu
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field, ValidationError
 
 from lfpiv_cli.calibration.model import Calibration
 from lfpiv_cli.calibration.white import vignetting_surface
@@ -38,14 +39,26 @@ from lfpiv_cli.files.checks import (
     SMALLEST_NUMBER,
     lens_image_faults,
 )
-from lfpiv_cli.files.hdf5 import ensure_format, open_h5, read_provenance, read_tree, write_tree
+from lfpiv_cli.files.hdf5 import open_h5, read_provenance, read_tree, write_tree
 from lfpiv_cli.files.inputs import physical_memory
-from lfpiv_cli.files.sections import MOST_PIXELS_PER_SIDE, MOST_VOXELS_PER_SIDE
+from lfpiv_cli.files.sections import (
+    MOST_VOXELS_PER_SIDE,
+    FaceSection,
+    Index,
+    Pair,
+    Pixels,
+    Section,
+    Vector,
+    Voxels,
+    WindowSection,
+    scene_of,
+)
+from lfpiv_cli.files.yaml_nodes import Document, problem_of
 from lfpiv_cli.grid import Grid
-from lfpiv_cli.names import ColumnAxis, Facing, Layout, Refraction, TracedMethod, names_in
+from lfpiv_cli.names import ColumnAxis, Layout, Refraction, TracedMethod
 from lfpiv_cli.notice import written
 from lfpiv_cli.optics.camera import Camera, Lattice
-from lfpiv_cli.optics.curved_space import CurvedSpace, Face
+from lfpiv_cli.optics.curved_space import CurvedSpace
 from lfpiv_cli.optics.media import Media, Window
 from lfpiv_cli.optics.surfaces import SURFACES
 from lfpiv_cli.optics.tracing import ObjectSpace
@@ -70,17 +83,58 @@ UNITS = calibration_file.UNITS | dict.fromkeys((*NUMBERS, *BLOCKS), "1")
 UNITS |= dict.fromkeys(("shape_xyz", "padding_xyz"), "voxel")
 # Coefficients of `white.vignetting_surface`.
 VIGNETTING_SHAPE = (5, 5)
-# Of the camera, those above 0; what else there is of numbers may have any sign.
-POSITIVE = (
-    *("focal_length_mm", "aperture_mm", "microlens_focal_length_mm", "microlens_distance_mm"),
-    *("pixel_mm", "entrance_over_exit"),
-)
-CAMERA_SCALARS = ("magnification", *POSITIVE, "columns", "rows", "column_axis", "distortion_per_mm2")
 # A kernel holds a volume, its padding, what it is made from, and as many numbers of each pixel.
 BYTES_A_VOXEL, BYTES_A_PIXEL = 8, 8
 # A basis whose vectors are nearly parallel is of no array: hexagons have 0.87.
 LEAST_SINE = 0.5
-LARGEST_INDEX = 5.0
+
+
+# The camera, the grid and what rays cross, believed only as far as a config would be.
+Size = Annotated[float, Field(ge=SMALLEST_NUMBER)]
+Padding = Annotated[int, Field(ge=0, le=MOST_VOXELS_PER_SIDE)]
+
+
+class StoredCamera(Section):
+    """The group `camera`, in the order of the file."""
+
+    magnification: Annotated[float, Field(le=-SMALLEST_NUMBER)]
+    focal_length_mm: Size
+    aperture_mm: Size
+    microlens_focal_length_mm: Size
+    microlens_distance_mm: Size
+    pixel_mm: Size
+    entrance_over_exit: Size
+    columns: Pixels
+    rows: Pixels
+    column_axis: ColumnAxis
+    distortion_per_mm2: float
+    layout: Layout
+    lattice_origin_mm: Pair
+    lattice_basis_mm: tuple[Pair, Pair]
+
+
+class StoredGrid(Section):
+    """What the group `grid` says of voxels."""
+
+    shape_xyz: tuple[Voxels, Voxels, Voxels]
+    spacing_mm: tuple[Size, Size, Size]
+    origin_mm: Vector
+    padding_xyz: tuple[Padding, Padding, Padding]
+
+
+class StoredSpace(Section):
+    """What the group `on_demand` says of what rays cross: the faces of a scene, or plane layers."""
+
+    air: Index
+    window: Index
+    fluid: Index
+    faces: tuple[FaceSection, ...] | None = None
+    method: TracedMethod
+    refraction: Refraction
+    window_face: WindowSection | None = None
+
+
+Stored = TypeVar("Stored", bound=Section)
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,13 +202,12 @@ class WeightsFile:
 
 def write_weights(path: Path, content: WeightsFile, overwrite: bool) -> None:
     """Write a weights file."""
-    weights, camera = content.weights, content.camera
+    weights, lattice = content.weights, content.camera.lattice
+    arrays = {"lattice_origin_mm": lattice.origin, "lattice_basis_mm": lattice.basis, "layout": lattice.layout}
     tree: dict[str, Any] = {
-        "camera": {name: getattr(camera, name) for name in CAMERA_SCALARS}
-        | {
-            "layout": camera.lattice.layout,
-            "lattice_origin_mm": camera.lattice.origin,
-            "lattice_basis_mm": camera.lattice.basis,
+        "camera": {
+            name: arrays[name] if name in arrays else getattr(content.camera, name)
+            for name in StoredCamera.model_fields
         },
         "grid": {
             "shape_xyz": np.asarray(weights.grid.shape_xyz),
@@ -166,7 +219,7 @@ def write_weights(path: Path, content: WeightsFile, overwrite: bool) -> None:
             "voxels_outside_fluid": weights.voxels_outside_fluid,
         },
         "vignetting": content.vignetting,
-        "calibration": weights.calibration.to_tree() if weights.calibration else None,
+        "calibration": calibration_file.tree_of(weights.calibration) if weights.calibration else None,
     } | _operator_tree(weights.solver_operator)
     made = content.provenance
     write_tree(
@@ -182,11 +235,15 @@ def open_weights(path: Path | str) -> WeightsFile:
     InputError : the file is missing, broken, of another format or version, or contradicts itself.
     """
     path = Path(path)
-    tree, provenance = read_tree(path, FORMAT, (VERSION,))
+    tree, provenance = read_tree(path, FORMAT, VERSION)
     try:
-        camera = _camera(_group(tree, "camera"))
-        grid, padding = _grid(_group(tree, "grid"))
-        calibration = Calibration.from_tree(tree["calibration"]) if tree.get("calibration") else None
+        camera = _camera(_stored(StoredCamera, tree["camera"]))
+        told = _stored(StoredGrid, tree["grid"])
+        grid, padding = Grid(told.shape_xyz, told.spacing_mm, told.origin_mm), told.padding_xyz
+        voxels = math.prod(grid.padded(padding).shape_xyz)
+        if BYTES_A_VOXEL * voxels > physical_memory():
+            raise ValueError(f"{voxels} voxels do not fit into memory")
+        calibration = calibration_file.calibration_of(tree["calibration"]) if tree.get("calibration") else None
         if calibration:
             calibration.ensure_images_of(camera)
         operator = _operator(tree, camera, grid.padded(padding), calibration)
@@ -201,17 +258,32 @@ def open_weights(path: Path | str) -> WeightsFile:
 
 def read_weights_record(path: Path) -> dict[str, Any]:
     """Return the record that a weights file carries; the weights themselves are not read."""
-    with open_h5(path) as file:
-        ensure_format(path, file, FORMAT, (VERSION,))
+    with open_h5(path, FORMAT, VERSION) as file:
         return read_provenance(file)
 
 
-def _group(tree: dict[str, Any], name: str) -> dict[str, Any]:
-    """Return a group of a tree."""
-    found = tree[name]
-    if not isinstance(found, dict):
-        raise ValueError(f"{name} is no group")
-    return found
+def _stored(kind: type[Stored], group: Any) -> Stored:
+    """Return what a group says of a kind; what is missing, or nothing that it could have, is a `ValueError`."""
+    if not isinstance(group, dict):
+        raise ValueError("a group is missing")
+    plain = {name: _plain(name, group[name]) for name in kind.model_fields if group.get(name) is not None}
+    try:
+        return kind.model_validate(plain)
+    except ValidationError as error:
+        problem = problem_of(Document(data=plain), error.errors()[0])
+        raise ValueError(f"{problem.key}: {problem.message}") from error
+
+
+def _plain(name: str, value: Any) -> Any:
+    """Return arrays as tuples, as sections have them, and numbers up to the largest that a config may have."""
+    if isinstance(value, dict):
+        return {each: _plain(each, item) for each, item in value.items()}
+    items = value.tolist() if isinstance(value, np.ndarray) else value
+    if isinstance(items, (list, tuple)):
+        return tuple(_plain(name, item) for item in items)
+    if isinstance(items, (int, float)) and not abs(items) <= LARGEST_NUMBER:
+        raise ValueError(f"{name} is {items!r}, expected a number of at most {written(LARGEST_NUMBER)}")
+    return items
 
 
 def _numbers(tree: dict[str, Any], name: str, shape: tuple[int, ...]) -> NDArray[Any] | None:
@@ -282,7 +354,7 @@ def _strips(
     tree: dict[str, Any], shape: tuple[int, int, int], camera: Camera, optics: tuple[AxisOptics, AxisOptics]
 ) -> StripOperator:
     """Return weights in strips of a volume of `shape` (planes, row voxels, column voxels)."""
-    strips = _group(tree, "strips")
+    strips = tree["strips"]
     lit, turned, misfit = (strips[name] for name in ("lit", "turned", "misfit_l1"))
     if lit.shape != shape or lit.dtype != np.uint8 or type(turned) is not bool:
         raise ValueError(f"strips of a volume of {lit.shape}, expected {shape}")
@@ -319,18 +391,16 @@ def _source(tree: dict[str, Any], calibration: Calibration | None) -> Source:
         if calibration is None or calibration.ray_fit is None:
             raise ValueError("fitted rays are missing")
         return calibration.ray_fit.rays
-    indices = [_number(name, tree[name]) for name in ("air", "window", "fluid")]
-    if not (min(indices) >= 1.0 and max(indices) <= LARGEST_INDEX):
-        raise ValueError(f"its refractive indices are {indices}, expected 1 to {LARGEST_INDEX:g}")
-    media = Media(*indices)
     if "faces" in tree:
-        faces = _group(tree, "faces")
-        return CurvedSpace(media, tuple(_face(faces[str(k)]) for k in range(len(faces))))
-    face = tree.get("window_face")
-    if tree["method"] not in names_in(TracedMethod) or tree["refraction"] not in names_in(Refraction):
-        raise ValueError(f"unknown tracing: {tree['method']}, {tree['refraction']}")
-    window = Window(**{name: _number(name, value) for name, value in face.items()}) if face else None
-    return ObjectSpace(media, window, tree["refraction"], tree["method"])
+        numbered = [dict(tree["faces"][str(k)]) for k in range(len(tree["faces"]))]  # from the camera on
+        faces = tuple(face | {"behind": face.pop("index")} for face in numbered)
+        tree = tree | {"faces": faces, "refraction": "exact"}
+    told = _stored(StoredSpace, tree)
+    media = Media(told.air, told.window, told.fluid)
+    if told.faces is not None:
+        return scene_of(told.faces, media)
+    window = None if told.window_face is None else Window(**told.window_face.model_dump())
+    return ObjectSpace(media, window, told.refraction, told.method)
 
 
 def _axis_weights(
@@ -370,107 +440,17 @@ def _table(
     return start.astype(np.int64), place.astype(np.int32), share.astype(np.float32)
 
 
-# The camera, the grid and the faces, believed only as far as a config would be: what is missing, of another kind, or
-# nothing that they could have raises KeyError, TypeError or ValueError.
-
-
-def _camera(tree: dict[str, Any]) -> Camera:
-    """Return the camera of a weights file."""
-    values: dict[str, Any] = {name: _positive(name, tree[name]) for name in POSITIVE}
-    values |= {name: _whole(name, tree[name], 1, MOST_PIXELS_PER_SIDE) for name in ("columns", "rows")}
-    values["magnification"] = -_positive(
-        "the reverse of magnification", -_number("magnification", tree["magnification"])
-    )
-    values["distortion_per_mm2"] = _number("distortion_per_mm2", tree["distortion_per_mm2"])
-    for name, allowed in (("column_axis", names_in(ColumnAxis)), ("layout", names_in(Layout))):
-        if tree[name] not in allowed:
-            raise ValueError(f"{name} is {tree[name]!r}, expected one of {', '.join(allowed)}")
-    values["column_axis"] = tree["column_axis"]
-    pixels = values["columns"] * values["rows"]
-    if BYTES_A_PIXEL * pixels > physical_memory():
-        raise ValueError(f"{values['columns']} x {values['rows']} pixels do not fit into memory")
-    origin, basis = _array("lattice_origin_mm", tree, (2,)), _array("lattice_basis_mm", tree, (2, 2))
-    lattice = Lattice(origin, basis, tree["layout"])
+def _camera(told: StoredCamera) -> Camera:
+    """Return the camera of a weights file, if its lens images can be told apart and its images fit into memory."""
+    if BYTES_A_PIXEL * told.columns * told.rows > physical_memory():
+        raise ValueError(f"{told.columns} x {told.rows} pixels do not fit into memory")
+    lattice = Lattice(np.array(told.lattice_origin_mm), np.array(told.lattice_basis_mm), told.layout)
     if not lattice.cell_area >= LEAST_SINE * math.prod(lattice.pitch):
-        raise ValueError(f"the lattice's basis {basis.tolist()} is of no array of lenses")
-    camera = Camera(lattice=lattice, **values)
+        raise ValueError(f"the lattice's basis {told.lattice_basis_mm} is of no array of lenses")
+    camera = Camera(lattice=lattice, **told.model_dump(exclude={"layout", "lattice_origin_mm", "lattice_basis_mm"}))
     pitch_px = camera.lattice.pitch / camera.pixel_mm
     if not (pitch_px.min() >= FEWEST_PIXELS_A_LENS and pitch_px.max() <= MOST_PIXELS_A_LENS):
         raise ValueError(f"its lens images are {pitch_px.tolist()} px apart")
     for fault in lens_image_faults(camera):
         raise ValueError(fault[1])
     return camera
-
-
-def _grid(tree: dict[str, Any]) -> tuple[Grid, tuple[int, int, int]]:
-    """Return the grid of a weights file and its padding."""
-    shape, padding = (
-        _triple(name, tree[name], lambda name, value, least=least: _whole(name, value, least, MOST_VOXELS_PER_SIDE))
-        for name, least in (("shape_xyz", 1), ("padding_xyz", 0))
-    )
-    spacing = _triple("spacing_mm", tree["spacing_mm"], _positive)
-    origin = _triple("origin_mm", tree["origin_mm"], _number)
-    grid = Grid(shape, spacing, origin)
-    voxels = math.prod(grid.padded(padding).shape_xyz)
-    if BYTES_A_VOXEL * voxels > physical_memory():
-        raise ValueError(f"{voxels} voxels do not fit into memory")
-    return grid, padding
-
-
-def _face(tree: dict[str, Any]) -> Face:
-    """Return a face that rays cross."""
-    if tree["kind"] not in SURFACES:
-        raise ValueError(f"a face is a {tree['kind']!r}, expected one of {', '.join(SURFACES)}")
-    kind = SURFACES[tree["kind"]]
-    values: dict[str, Any] = {}
-    for name in (field.name for field in fields(kind)):  # type: ignore[arg-type]
-        value = values[name] = tree[name]
-        if name == "facing":
-            if value not in names_in(Facing):
-                raise ValueError(f"facing is {value!r}, expected one of {', '.join(names_in(Facing))}")
-        elif name == "heights_mm":
-            heights = _array(name, tree, np.shape(value) if np.ndim(value) == 2 else (0, 0))
-            values[name] = tuple(tuple(row) for row in heights.tolist())
-        elif name == "spacing_mm":
-            values[name] = tuple(_positive(name, each) for each in _array(name, tree, (2,)).tolist())
-        elif isinstance(value, np.ndarray):
-            values[name] = _triple(name, value, _number)
-        else:
-            values[name] = (_positive if name == "radius_mm" else _number)(name, value)
-    index = _number("index", tree["index"])
-    if not 1.0 <= index <= LARGEST_INDEX:
-        raise ValueError(f"the index behind a face is {index:g}, expected 1 to {LARGEST_INDEX:g}")
-    return Face(kind(**values), index)
-
-
-def _array(name: str, tree: dict[str, Any], shape: tuple[int, ...]) -> NDArray[np.float64]:
-    array = np.asarray(tree[name])
-    if array.shape != shape or array.dtype.kind not in "fiu" or not (np.abs(array) <= LARGEST_NUMBER).all():
-        raise ValueError(f"{name} is {array.tolist()}, expected numbers of the shape {shape}")
-    return array.astype(np.float64)
-
-
-def _triple(name: str, values: Any, kind: Any) -> tuple[Any, Any, Any]:
-    if np.shape(values) != (3,):
-        raise ValueError(f"{name} has the shape {np.shape(values)}, expected (3,)")
-    first, second, third = (kind(name, value.item()) for value in np.asarray(values))
-    return first, second, third
-
-
-def _number(name: str, value: Any) -> float:
-    """Return a number of a file; a `ValueError` says which is none."""
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) <= LARGEST_NUMBER:
-        raise ValueError(f"{name} is {value!r}, expected a number")
-    return float(value)
-
-
-def _positive(name: str, value: Any) -> float:
-    if not _number(name, value) >= SMALLEST_NUMBER:
-        raise ValueError(f"{name} is {value!r}, expected {written(SMALLEST_NUMBER)} or more")
-    return float(value)
-
-
-def _whole(name: str, value: Any, least: int, most: int) -> int:
-    if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
-        raise ValueError(f"{name} is {value!r}, expected a whole number from {least} to {most}")
-    return value

@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 from pydantic_core import ErrorDetails
 
 from lfpiv_cli.errors import ConfigError, InputError
-from lfpiv_cli.files.images import format_of, read_image
+from lfpiv_cli.files.images import format_of, read_single
 from lfpiv_cli.files.inputs import content_of, ensure_regular_file, opened, reason
-from lfpiv_cli.files.sections_simulated import Sections
+from lfpiv_cli.files.sections_work import Sections
 from lfpiv_cli.notice import written
 
 # Libyaml's loader is the same parser in C, ten times as fast; both are safe, as only their nodes are used.
@@ -78,12 +78,9 @@ class Document:
     problems: list[Problem] = field(default_factory=list)
 
 
-class YamlError(Exception):
-    """The text is not YAML of the kind that is read here; holds the one `Problem` that ended the reading."""
-
-    def __init__(self, line: int, column: int, message: str) -> None:
-        super().__init__(message)
-        self.problem = Problem(line, column, "", message)
+def _broken(source: str, line: int, column: int, message: str) -> ConfigError:
+    """Return the error of a text that is not YAML of the kind that is read here, at the place where reading ended."""
+    return ConfigError(sentence(source, Problem(line, column, "", message)))
 
 
 def read_rig(path: Path) -> Document:
@@ -104,10 +101,7 @@ def read_rig(path: Path) -> Document:
             raise ConfigError(f"{path}: is {what}; expected a rig file")
     if size > LARGEST_BYTES:
         raise ConfigError(f"{path}: has {size} bytes, expected at most {LARGEST_BYTES}")
-    try:
-        document = _read_document(content_of(path))
-    except YamlError as error:
-        raise ConfigError(sentence(str(path), error.problem)) from error
+    document = _read_document(content_of(path), str(path))
     scene = document.data.get("scene")
     faces = list(scene) if isinstance(scene, tuple) else []
     for k, face in enumerate(faces):
@@ -126,60 +120,59 @@ def read_rig(path: Path) -> Document:
     return document
 
 
-def _read_document(content: bytes) -> Document:
+def _read_document(content: bytes, source: str) -> Document:
     """Read a YAML document whose root is a mapping.
 
     Raises
     ------
-    YamlError : it is not UTF-8, not YAML, too deep, or uses aliases, tags or several documents
+    ConfigError : it is not UTF-8, not YAML, too deep, or uses aliases, tags or several documents
     """
     try:
         text = content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         before = content[: error.start]
-        line = before.count(b"\n") + 1
-        raise YamlError(line, error.start - before.rfind(b"\n"), "is not UTF-8 text") from error
+        place = before.count(b"\n") + 1, error.start - before.rfind(b"\n")
+        raise _broken(source, *place, "is not UTF-8 text") from error
     if found := re.search(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f]", text):  # no editor shows them
         line, column = text.count("\n", 0, found.start()) + 1, found.start() - text.rfind("\n", 0, found.start())
-        raise YamlError(line, column, f"holds the control character {ord(found.group()):#04x}")
+        raise _broken(source, line, column, f"holds the control character {ord(found.group()):#04x}")
     try:
-        _ensure_plain(text)
+        _ensure_plain(text, source)
         root = yaml.compose(text, Loader=LOADER)
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         line, column = (mark.line + 1, mark.column + 1) if mark else (1, 1)
         tab = text.splitlines()[line - 1 : line] and text.splitlines()[line - 1][column - 1 :].startswith("\t")
         problem = "a tab where only spaces may indent" if tab else error.problem or error.context
-        raise YamlError(line, column, f"is not YAML: {problem}") from error
+        raise _broken(source, line, column, f"is not YAML: {problem}") from error
     except yaml.YAMLError as error:
-        raise YamlError(1, 1, f"is not YAML: {str(error).splitlines()[0]}") from error
+        raise _broken(source, 1, 1, f"is not YAML: {str(error).splitlines()[0]}") from error
     document = Document()
     if root is not None and not isinstance(root, yaml.MappingNode):
-        raise YamlError(*_place(root), "is not a mapping of sections")
+        raise _broken(source, *_place(root), "is not a mapping of sections")
     if root is not None:
         document.data = _plain(root, (), document)
     return document
 
 
-def _ensure_plain(text: str) -> None:
+def _ensure_plain(text: str, source: str) -> None:
     """Refuse aliases, tags, depth and further documents on the flat stream of events, before any tree is built."""
     depth = documents = 0
     for event in yaml.parse(text, Loader=LOADER):
-        place = _place(event)
+        documents += isinstance(event, yaml.DocumentStartEvent)
+        depth += isinstance(event, (yaml.MappingStartEvent, yaml.SequenceStartEvent))
+        depth -= isinstance(event, (yaml.MappingEndEvent, yaml.SequenceEndEvent))
         if isinstance(event, yaml.AliasEvent) or getattr(event, "anchor", None):
-            raise YamlError(*place, "uses an anchor or alias (& or *), which are not read here")
-        if (tag := getattr(event, "tag", None)) is not None:
-            raise YamlError(*place, f"uses the tag {tag}, which is not read here")
-        if isinstance(event, yaml.DocumentStartEvent):
-            documents += 1
-        if documents > 1:
-            raise YamlError(*place, "holds a second document, expected one")
-        if isinstance(event, (yaml.MappingStartEvent, yaml.SequenceStartEvent)):
-            depth += 1
-        elif isinstance(event, (yaml.MappingEndEvent, yaml.SequenceEndEvent)):
-            depth -= 1
-        if depth > DEEPEST:
-            raise YamlError(*place, f"is nested deeper than {DEEPEST} levels")
+            fault = "uses an anchor or alias (& or *), which are not read here"
+        elif (tag := getattr(event, "tag", None)) is not None:
+            fault = f"uses the tag {tag}, which is not read here"
+        elif documents > 1:
+            fault = "holds a second document, expected one"
+        elif depth > DEEPEST:
+            fault = f"is nested deeper than {DEEPEST} levels"
+        else:
+            continue
+        raise _broken(source, *_place(event), fault)
 
 
 def _plain(node: yaml.Node, path: KeyPath, document: Document) -> Any:
@@ -222,13 +215,7 @@ def _place(node: yaml.Node | yaml.Event) -> tuple[int, int]:
 
 def key_name(path: KeyPath) -> str:
     """Return a place as users write it: `correlation.windows[0]`."""
-    name = ""
-    for part in path:
-        if isinstance(part, int):
-            name += f"[{part}]"
-        else:
-            name += f".{part}" if name else part
-    return name
+    return "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in path).removeprefix(".")
 
 
 # What is wrong with a configuration, as sentences about places: `rig.yaml:5:16: camera.x: is 3, expected ...`.
@@ -292,9 +279,8 @@ def problem_of(document: Document, details: ErrorDetails) -> Problem:
             path = (*path, "kind")
         text = MISSING.get(path, "is missing")
     elif kind == "too_long" or kind == "too_short":
-        text = (
-            f"has {context['actual_length']} entries, expected {context.get('max_length', context.get('min_length'))}"
-        )
+        expected = context.get("max_length", context.get("min_length"))
+        text = f"has {context['actual_length']} entries, expected {expected}"
     elif kind == "literal_error":
         text = f"is {_shown(value)}, expected {context['expected']}"
     elif kind == "union_tag_invalid":
@@ -333,14 +319,13 @@ def place_of(document: Document, path: KeyPath) -> tuple[int, int]:
     """Return line and column of a value, or of the nearest section around it."""
     while path and path not in document.values:
         path = path[:-1]
-    return document.values.get(path, (0, 0)) if path else document.values.get((), (0, 0))
+    return document.values.get(path, (0, 0))
 
 
 def _shown(value: Any) -> str:
     """Return a value as it would stand in the file, cut where it is long."""
-    words: dict[Any, str] = {None: "empty", True: "true", False: "false"}
     if value is None or isinstance(value, bool):
-        return words[value]
+        return {None: "empty", True: "true", False: "false"}[value]
     if isinstance(value, Mapping):
         return "a section"
     text = repr(list(value)) if isinstance(value, tuple) else repr(value)
@@ -371,7 +356,7 @@ def read_heights(path: Path) -> Rows:
     ensure_regular_file(path)
     ending = path.suffix.lower()
     if ending in (".tif", ".tiff"):
-        rows = _rows_of(read_image(path), path)
+        rows = _rows_of(read_single(path), path)
     elif ending == ".npy":
         try:
             array = np.load(path, mmap_mode="r", allow_pickle=False)  # its size is held against the file's

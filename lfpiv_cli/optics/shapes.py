@@ -5,8 +5,8 @@ Axes: world axes, z away from the camera from the nominal focal point, mm.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -367,18 +367,3 @@ class ScenePose:
             "scene_turn_deg": self.turn_deg.tolist(),
             "scene_turn_deg_sigma": self.turn_sigma_deg.tolist(),
         }
-
-    @classmethod
-    def from_tree(cls, tree: Mapping[str, Any]) -> ScenePose:
-        """Return the pose of a dict of its fields.
-
-        Raises
-        ------
-        KeyError, ValueError : something is missing, or is no place
-        """
-        *places, digest = (field.name for field in fields(cls))
-        found: dict[str, Any] = {name: np.asarray(tree[name], dtype=np.float64) for name in places}
-        for name, place in found.items():
-            if place.shape != (3,) or not np.all(np.isfinite(place)):
-                raise ValueError(f"scene/{name} is no place")
-        return cls(**found, **{digest: tree[digest]})

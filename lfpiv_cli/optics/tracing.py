@@ -7,11 +7,9 @@ exception.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import cache
 from itertools import product
-from typing import Any
 
 import numpy as np
 from numba import njit
@@ -62,25 +60,6 @@ class PolynomialRays:
     def degree(self) -> int:
         """Largest sum of exponents."""
         return int(self.exponents.sum(axis=1).max(initial=0))
-
-    @classmethod
-    def from_tree(cls, tree: Mapping[str, Any]) -> PolynomialRays:
-        """Return the rays of a dict of their fields.
-
-        Raises
-        ------
-        KeyError, ValueError : something is missing or cannot be
-        """
-        rays = cls(**{field.name: tree[field.name] for field in fields(cls)})
-        terms = len(rays.exponents)
-        shapes = rays.scale_mm.shape, rays.exponents.shape, rays.coefficients_mm.shape
-        if shapes != ((VARIABLES,), (terms, VARIABLES), (terms, 2)) or not terms:
-            raise ValueError(f"polynomials of {shapes}")
-        if not np.isin(rays.exponents, range(LARGEST_DEGREE + 1)).all() or rays.degree > LARGEST_DEGREE:
-            raise ValueError(f"polynomials with exponents up to {rays.exponents.max()}")
-        if not np.isfinite(rays.coefficients_mm).all() or not np.all(rays.scale_mm > 0.0):
-            raise ValueError("polynomials with coefficients that are no numbers")
-        return rays
 
     def on_array(self, start_mm: ArrayLike, crossing_mm: ArrayLike) -> Floats:
         """Return where rays from (n, 3) through (n, 2) meet the array, (n, 2)."""

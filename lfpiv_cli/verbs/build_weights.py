@@ -15,7 +15,7 @@ from lfpiv_cli.console import CONSOLE, Console
 from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.files.atomic import ensure_writable
 from lfpiv_cli.files.batch import Target, is_kept
-from lfpiv_cli.files.calibration_file import read_calibration
+from lfpiv_cli.files.calibration_file import open_calibration
 from lfpiv_cli.files.config import Config, load_config
 from lfpiv_cli.files.inputs import given
 from lfpiv_cli.files.provenance import record, with_warnings
@@ -306,7 +306,7 @@ def build_weights_file(
     """
     inputs = given(config=config, calibration=options.calibration)
     ensure_writable(output, overwrite or options.resume, inputs.values())
-    found = read_calibration(options.calibration) if options.calibration else None
+    found = open_calibration(options.calibration) if options.calibration else None
     settings = load_config(config).overridden_by("weights", options).with_scene_of(found)
     if not options.dry_run:
         weights_cost.ensure_volume_fits(settings, by_volumes=False)

@@ -20,7 +20,7 @@ from lfpiv_cli.errors import ConfigError, UsageError
 from lfpiv_cli.files import images as image_files
 from lfpiv_cli.files.atomic import ensure_apart, ensure_writable
 from lfpiv_cli.files.batch import Target, is_kept
-from lfpiv_cli.files.calibration_file import read_calibration, write_calibration
+from lfpiv_cli.files.calibration_file import open_calibration, write_calibration
 from lfpiv_cli.files.config import Config, load_config
 from lfpiv_cli.files.inputs import given
 from lfpiv_cli.files.pages import ensure_drawing, write_picture
@@ -235,7 +235,7 @@ def calibrate_snapshot(
     if options.resume:
         kept = is_kept([output], record, inputs.values(), overwrite)
         if kept and all(path.exists() for path in drawings):
-            return read_calibration(output).summary()
+            return open_calibration(output).summary()
         overwrite = True
     camera = settings.camera_model() if views else None
     pictures = photographs(

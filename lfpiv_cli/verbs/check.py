@@ -16,9 +16,9 @@ from lfpiv_cli.calibration.model import Calibration
 from lfpiv_cli.console import CONSOLE, Console
 from lfpiv_cli.errors import ConfigError, InputError
 from lfpiv_cli.files.atomic import ensure_writable
-from lfpiv_cli.files.calibration_file import read_calibration
+from lfpiv_cli.files.calibration_file import open_calibration
 from lfpiv_cli.files.config import Config, load_config
-from lfpiv_cli.files.images import read_image, read_reference
+from lfpiv_cli.files.images import read_reference, read_single
 from lfpiv_cli.files.inputs import given
 from lfpiv_cli.files.pages import ensure_drawing, write_picture
 from lfpiv_cli.notice import written
@@ -339,11 +339,11 @@ def check(
     settings = load_config(config)
     shape = settings.image_shape()
     pictures = Pictures(
-        {path.name: read_image(path, shape) for path in images},
+        {path.name: read_single(path, shape) for path in images},
         None if options.white is None else read_reference(options.white, shape),
         None if options.dark is None else read_reference(options.dark, shape),
     )
-    found = None if options.calibration is None else read_calibration(options.calibration)
+    found = None if options.calibration is None else open_calibration(options.calibration)
     of_white, lines = lattice_of(settings, pictures)
     found = found or of_white
     bench = bench_of(settings, found, options.velocity_m_s)

@@ -22,7 +22,7 @@ from lfpiv_cli.files.config import Config, carried_config, load_config
 from lfpiv_cli.files.hdf5 import ensure_opens, fault_of
 from lfpiv_cli.files.inputs import ensure_room, given
 from lfpiv_cli.files.pairing import Pairs
-from lfpiv_cli.files.sections_simulated import CorrelationKeys
+from lfpiv_cli.files.sections_work import CorrelationKeys
 from lfpiv_cli.files.vtkhdf import Volume
 from lfpiv_cli.flow import correlation
 from lfpiv_cli.flow.correlation import correlate as measure

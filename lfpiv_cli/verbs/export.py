@@ -9,7 +9,7 @@ from typing import Any
 
 from lfpiv_cli.console import CONSOLE, Console
 from lfpiv_cli.errors import InputError, UsageError
-from lfpiv_cli.files.atomic import ensure_writable, write_atomically
+from lfpiv_cli.files.atomic import ensure_writable, written_atomically
 from lfpiv_cli.files.exports.formats import FORMATS, Content, ensure_fits, read_content, write_netcdf
 from lfpiv_cli.files.exports.vtk import write_series
 from lfpiv_cli.files.provenance import record
@@ -83,9 +83,11 @@ def export(
         write_series(target, first, read, len(files), times, made, overwrite=overwrite)
     elif write is None:
         contents = [read(number) for number in range(len(files))]
-        write_atomically(target, lambda path: write_netcdf(path, contents, times), overwrite=overwrite)
+        with written_atomically(target, overwrite=overwrite) as path:
+            write_netcdf(path, contents, times)
     else:
-        write_atomically(target, lambda path: write(path, first), overwrite=overwrite)
+        with written_atomically(target, overwrite=overwrite) as path:
+            write(path, first)
     return {
         "output": target.name,
         "format": first.format_name,

@@ -22,7 +22,7 @@ from lfpiv_cli.files.atomic import ensure_writable, write_text
 from lfpiv_cli.files.config import Config
 from lfpiv_cli.files.hdf5 import format_of
 from lfpiv_cli.files.inputs import content_of
-from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, TRAJECTORIES_FORMAT, Points, read_points, read_tracks
+from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, TRAJECTORIES_FORMAT, Points, open_tracks, read_points
 from lfpiv_cli.files.provenance import OF_COORDINATES, record, with_warnings
 from lfpiv_cli.flow.field import MASKED, MM_TO_M, REJECTED, VectorField
 from lfpiv_cli.grid import Grid
@@ -243,7 +243,7 @@ def fit_flow(
     parts = [
         fields.samples_of_vectors(vtkhdf.open_vectors(path), str(path))
         if format_of(path) == vtkhdf.VECTORS_FORMAT
-        else fields.samples_of_tracks(read_tracks(path), options.frame)
+        else fields.samples_of_tracks(open_tracks(path), options.frame)
         for path in paths
     ]
     found = fields.fitted(parts, settings, options.divergence, names[0])
@@ -282,7 +282,7 @@ def _pressure(paths: Sequence[Path], settings: Config, options: FieldOptions) ->
         raise UsageError("--pressure is for the tracks of one sequence, from follow or track")
     particles = [read_points(path, PARTICLES_FORMAT) for path in options.pressure]
     try:
-        return pressure_of(read_tracks(paths[0]), particles, settings, options.frame)
+        return pressure_of(open_tracks(paths[0]), particles, settings, options.frame)
     except InputError as error:
         raise InputError(f"{paths[0]} with {options.pressure[0].parent}: {error}") from error
 

@@ -20,7 +20,7 @@ from lfpiv_cli.files import vtkhdf
 from lfpiv_cli.files.batch import Target
 from lfpiv_cli.files.config import Config, carried_config
 from lfpiv_cli.files.hdf5 import format_of
-from lfpiv_cli.files.particle_file import TRACKS_FORMAT, TRAJECTORIES_FORMAT, Points, matrices, read_tracks
+from lfpiv_cli.files.particle_file import TRACKS_FORMAT, TRAJECTORIES_FORMAT, Points, matrices, open_tracks
 from lfpiv_cli.files.provenance import OF_COORDINATES, ensure_agreement, record
 from lfpiv_cli.flow import field as vector_field
 from lfpiv_cli.flow.combining import Paths, WindowGrid, vectors_from_paths, without_tracks
@@ -427,7 +427,7 @@ def _fields_in(path: Path) -> Iterator[VectorField]:
     if format_of(path) == vtkhdf.VECTORS_FORMAT:
         yield vtkhdf.open_vectors(path)
         return
-    tracks = read_tracks(path)
+    tracks = open_tracks(path)
     settings = carried_config(tracks.provenance, path)
     windows = windows_of(settings, settings.masking_walls())
     frames: Iterable[int | None] = [None]

@@ -156,7 +156,7 @@ def read_frame(frame: Frame, shape: tuple[int, int]) -> Image:
     """Read a frame (InputError: it cannot be read, or has another shape)."""
     if frame.fault is not None:
         raise InputError(frame.fault)
-    return image_files.read_page(frame.path, frame.page, shape)
+    return image_files.read_image(frame.path, frame.page, shape)
 
 
 def readable(read: Callable[[int], Found], numbers: Iterable[int], keep_going: bool) -> Iterator[Found]:

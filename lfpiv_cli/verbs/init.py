@@ -46,7 +46,7 @@ def init(output: Path, options: InitOptions, *, overwrite: bool = False, console
         raise UsageError(f"a configuration is from numbers, a camera or a calibration; {len(given)} of them were given")
     tree: Mapping[str, Any]
     if options.calibration is not None:
-        _, made = read_tree(options.calibration, calibration_file.FORMAT, (calibration_file.VERSION,))
+        _, made = read_tree(options.calibration, calibration_file.FORMAT, calibration_file.VERSION)
         sections = carried_config(made, options.calibration).sections
         title = f"The rig that {options.calibration.name} was made with, by `lfpiv init`."
         tree = sections.model_dump(mode="json", exclude_defaults=True)

@@ -15,12 +15,11 @@ from lfpiv_cli.console import CONSOLE, Console
 from lfpiv_cli.errors import ConfigError, InputError, UsageError
 from lfpiv_cli.files import calibration_file, vtkhdf, weights_file
 from lfpiv_cli.files.atomic import ensure_writable
-from lfpiv_cli.files.calibration_file import read_calibration
+from lfpiv_cli.files.calibration_file import open_calibration
 from lfpiv_cli.files.config import carried_config
 from lfpiv_cli.files.figures import FIGURES, describe, is_recording, recording_figures
-from lfpiv_cli.files.hdf5 import format_of, open_h5
-from lfpiv_cli.files.hdf5_checks import member
-from lfpiv_cli.files.images import read_image
+from lfpiv_cli.files.hdf5 import format_of, member, open_h5
+from lfpiv_cli.files.images import read_single
 from lfpiv_cli.files.inputs import given
 from lfpiv_cli.files.pages import ensure_drawing, write_pdf, write_picture
 from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, TRACKS_FORMAT, TRAJECTORIES_FORMAT, Points, read_points
@@ -104,11 +103,11 @@ def _of_particles(path: Path, raw: Path | None) -> Figures:
         config = carried_config(points.provenance, path)
         focal_point = points.reference.points_to_focal_point(points.position_mm)
         places = of_points.places_px(focal_point, config.camera_model(), config.media_model(), config.scene_space())
-        image = read_image(raw, config.image_shape()).astype(np.float64)
+        image = read_single(raw, config.image_shape()).astype(np.float64)
         figures["image"] = partial(of_points.image_figure, image, places, z_mm)
     left = residual_path(path)
     if left.is_file():
-        figures["residual"] = partial(of_points.residual_figure, read_image(left).astype(np.float64))
+        figures["residual"] = partial(of_points.residual_figure, read_single(left).astype(np.float64))
     if len(z_mm):
         spread = arrays["covariance_mm2"]
         figures["depths"] = partial(of_points.depths_figure, z_mm, arrays["intensity"], spread)
@@ -163,10 +162,10 @@ def _of_volume(path: Path) -> Figures:
 
 
 def _of_calibration(path: Path, white: Path | None) -> Figures:
-    calibration = read_calibration(path)
+    calibration = open_calibration(path)
     figures: Figures = {"summary": partial(of_calibration.summary_figure, calibration)}
     if white is not None:
-        image = read_image(white, calibration.image_shape)
+        image = read_single(white, calibration.image_shape)
         figures["lattice"] = partial(of_calibration.calibration_figure, calibration, image)
     return figures
 

@@ -15,7 +15,7 @@ from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.files import images as image_files
 from lfpiv_cli.files.atomic import ensure_apart, ensure_writable
 from lfpiv_cli.files.batch import frames_of
-from lfpiv_cli.files.calibration_file import read_calibration, write_calibration
+from lfpiv_cli.files.calibration_file import open_calibration, write_calibration
 from lfpiv_cli.files.config import Config, load_config
 from lfpiv_cli.files.inputs import given
 from lfpiv_cli.files.pages import ensure_drawing, write_picture
@@ -69,7 +69,7 @@ def refine_calibration(
         ensure_writable(target, overwrite)
     if picture:
         ensure_drawing()
-    before = read_calibration(calibration)
+    before = open_calibration(calibration)
     told = load_config(config)
     settings = told.with_scene_of(before)
     scene = settings.scene_space()
@@ -77,7 +77,7 @@ def refine_calibration(
         raise ConfigError(f"{config}: channel: is missing; the walls are known by the channel's width, or by a scene")
     frames, shape = frames_of(images), settings.image_shape()
     dark_image, empty = (image_files.read_reference(path, shape) if path else None for path in (dark, background))
-    lit = [light(image_files.read_page(frame.path, frame.page, shape), dark_image, empty) for frame in frames]
+    lit = [light(image_files.read_image(frame.path, frame.page, shape), dark_image, empty) for frame in frames]
     found: Refinement | SceneRefinement
     if scene is None:
         found = _walls(settings, lit, before, console)

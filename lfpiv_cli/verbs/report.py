@@ -18,7 +18,7 @@ from lfpiv_cli.console import CONSOLE, Console, readable
 from lfpiv_cli.errors import InputError, UsageError
 from lfpiv_cli.files import calibration_file, weights_file
 from lfpiv_cli.files.atomic import ensure_writable
-from lfpiv_cli.files.calibration_file import read_calibration
+from lfpiv_cli.files.calibration_file import open_calibration
 from lfpiv_cli.files.hdf5 import open_h5, read_provenance
 from lfpiv_cli.files.images import count_pages
 from lfpiv_cli.files.pages import (
@@ -36,8 +36,8 @@ from lfpiv_cli.files.particle_file import (
     TRACKS_FORMAT,
     TRAJECTORIES_FORMAT,
     Points,
+    open_tracks,
     read_points,
-    read_tracks,
 )
 from lfpiv_cli.files.provenance import sha256
 from lfpiv_cli.files.vtkhdf import VECTORS_FORMAT, VOLUME_FORMAT, open_vectors, read_header
@@ -269,7 +269,7 @@ def _chain(contents: Contents, fields: Fields, drawer: Drawer) -> Iterable[Secti
             pictures += drawer.pictures(path, only=OF_OTHERS)
         yield Section("Vectors", "vectors", text, (table,), tuple(pictures))
     for path in contents.of("tracks")[:1]:
-        points = read_tracks(path)
+        points = open_tracks(path)
         view = _view(points) if has_views() and len(points.position_mm) else ""
         text = (f"The view can be turned; it shows at most {MOST_LINES} tracks.",) if view else ()
         yield Section("Tracks", "tracks", text, (), tuple(drawer.pictures(path)), view=view)
@@ -281,7 +281,7 @@ def _chain(contents: Contents, fields: Fields, drawer: Drawer) -> Iterable[Secti
             role = "image" if kind == "particles" else ""
             yield Section(title, kind, text, (table,), tuple(drawer.pictures(paths[0], role)))
     for path in contents.of("calibration")[:1]:
-        summary = read_calibration(path).summary()
+        summary = open_calibration(path).summary()
         rows = tuple((name, _cell(value)) for name, value in summary.items() if value is not None)
         table = Table("What the white image and the board show", ("figure", "value"), rows)
         pictures = drawer.pictures(path, "white")

@@ -26,7 +26,7 @@ from lfpiv_cli.errors import ConfigError, InputError, LfpivError, OutputExistsEr
 from lfpiv_cli.files import images as image_files
 from lfpiv_cli.files.atomic import ensure_writable, write_text
 from lfpiv_cli.files.batch import Frame, frames_of, output_paths, pending
-from lfpiv_cli.files.calibration_file import read_calibration
+from lfpiv_cli.files.calibration_file import open_calibration
 from lfpiv_cli.files.config import Config, load_config
 from lfpiv_cli.files.inputs import ensure_regular_file, split_part
 from lfpiv_cli.files.pages import ensure_drawing, ensure_pages
@@ -174,7 +174,7 @@ def _ensure_possible(settings: Config, options: RunOptions) -> tuple[list[Frame]
     if not options.keep_going:
         for path in dict.fromkeys(frame.path for frame in frames):
             if image_files.frames(path).shape != settings.image_shape():
-                image_files.read_page(path, 0, settings.image_shape())  # says what is wrong, before any is read
+                image_files.read_image(path, 0, settings.image_shape())  # says what is wrong, before any is read
     return frames, pairs
 
 
@@ -366,7 +366,7 @@ def _from_nothing(chain: Chain) -> dict[str, Any]:
     cost: Cost | None = None
     # What the weights will cost is not always known without a calibration.
     with contextlib.suppress(LfpivError):
-        plan = plan_of(settings, read_calibration(calibration) if calibration.exists() else None)
+        plan = plan_of(settings, open_calibration(calibration) if calibration.exists() else None)
         cost = cost_of(settings, plan.camera, plan.source, plan.grid.padded(plan.padding))
     held = None if cost is None else cost.image_bytes
     sizes = {

@@ -240,7 +240,7 @@ def summary_of(worked: Worked[Outcome], paths: Sequence[Path]) -> dict[str, Any]
         told = outcomes[0].figures if outcomes else {"tracks": 0}
         if not outcomes and paths[0].exists():
             # Of two frames, or of a sequence, which has a place for each frame of a track.
-            points = particle_file.read_tracks(paths[0])
+            points = particle_file.open_tracks(paths[0])
             number = points.arrays.get("track")
             told = {"tracks": len(points.position_mm) if number is None else len(np.unique(number))}
     else:

@@ -19,7 +19,7 @@ from lfpiv_cli.files.inputs import given
 from lfpiv_cli.files.pages import ensure_drawing, write_picture
 from lfpiv_cli.files.particles import MM_PER_M, read_particles
 from lfpiv_cli.files.provenance import record
-from lfpiv_cli.files.sections_simulated import FlowSection
+from lfpiv_cli.files.sections_work import FlowSection
 from lfpiv_cli.flow.field import VectorField
 from lfpiv_cli.flow.windows import RoundWall
 from lfpiv_cli.names import FlowMethod, Moment

@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 
 from lfpiv_cli.errors import InputError, OutputError, UsageError
 from lfpiv_cli.files.exports import vtk
-from lfpiv_cli.files.hdf5 import format_of, open_h5
-from lfpiv_cli.files.hdf5_checks import array_member, member
+from lfpiv_cli.files.hdf5 import array_member, format_of, member, open_h5
 from lfpiv_cli.files.particle_file import (
     PARTICLES_FORMAT,
     POSITION,

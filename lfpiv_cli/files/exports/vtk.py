@@ -13,11 +13,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from xml.sax.saxutils import quoteattr
 
-import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from lfpiv_cli.files.hdf5 import FILTERS, create, write_array, write_rows
+from lfpiv_cli.files.hdf5 import FILTERS, created, write_array, write_rows
 from lfpiv_cli.files.particle_file import CELLS, POSITION, TRAJECTORIES_FORMAT, UNITS, PointRows, Points, lines_of
 from lfpiv_cli.files.vtkhdf import create_vtk_group, write_root, write_steps
 from lfpiv_cli.reference import Reference
@@ -32,39 +31,32 @@ if TYPE_CHECKING:
 LENGTH = np.dtype("<u8")
 
 
-class _Appended:
-    """The arrays that lie behind the XML."""
-
-    def __init__(self) -> None:
-        """Begin with none."""
-        self.arrays: list[NDArray[Any]] = []
-        self._offset = 0
-
-    def element(self, name: str, array: NDArray[Any], unit: str | None = None) -> str:
-        """Add an array, a row for each place; return the element that speaks of it."""
-        kind = {"f": "Float", "i": "Int", "u": "UInt"}[array.dtype.kind]
-        components = array.shape[1] if array.ndim == 2 else 1
-        head = (
-            f'<DataArray type="{kind}{8 * array.itemsize}" Name={quoteattr(name)} NumberOfComponents="{components}" '
-            f'format="appended" offset="{self._offset}"'
-        )
-        self.arrays.append(np.ascontiguousarray(array, array.dtype.newbyteorder("<")))
-        self._offset += LENGTH.itemsize + array.nbytes
-        if unit is None:
-            return f"{head}/>\n"
-        label = f'<InformationKey name="UNITS_LABEL" location="vtkDataArray">{unit}</InformationKey>'
-        return f"{head}>{label}</DataArray>\n"
+def _element(appended: list[NDArray[Any]], name: str, array: NDArray[Any], unit: str | None = None) -> str:
+    """Add an array, a row for each place, to those behind the XML; return the element that speaks of it."""
+    kind = {"f": "Float", "i": "Int", "u": "UInt"}[array.dtype.kind]
+    components = array.shape[1] if array.ndim == 2 else 1
+    offset = sum(LENGTH.itemsize + each.nbytes for each in appended)
+    appended.append(np.ascontiguousarray(array, array.dtype.newbyteorder("<")))
+    head = (
+        f'<DataArray type="{kind}{8 * array.itemsize}" Name={quoteattr(name)} NumberOfComponents="{components}" '
+        f'format="appended" offset="{offset}"'
+    )
+    if unit is None:
+        return f"{head}/>\n"
+    label = f'<InformationKey name="UNITS_LABEL" location="vtkDataArray">{unit}</InformationKey>'
+    return f"{head}>{label}</DataArray>\n"
 
 
 def write_vti(path: Path, content: Content) -> None:
     """Write a volume or vectors as an image of VTK, a point for each voxel or window."""
     if content.grid is None:
         raise ValueError("points are no image")
-    grid, appended = content.grid, _Appended()
+    appended: list[NDArray[Any]] = []
+    grid = content.grid
     extent = " ".join(f"0 {count - 1}" for count in grid.shape_xyz)
     vectors = ' Vectors="velocity"' if "velocity" in content.arrays else ""
     arrays = "".join(
-        appended.element(name, array.reshape(-1, *array.shape[3:]), content.units[name])
+        _element(appended, name, array.reshape(-1, *array.shape[3:]), content.units[name])
         for name, array in content.arrays.items()
     )
     origin, spacing = (" ".join(map(repr, map(float, each))) for each in (grid.origin_mm, grid.spacing_mm))
@@ -77,11 +69,12 @@ def write_vti(path: Path, content: Content) -> None:
 
 def write_vtp(path: Path, content: Content) -> None:
     """Write particles or tracks as points of VTK: a vertex for each, and a line for each track of a sequence."""
-    appended, position = _Appended(), content.arrays[POSITION]
+    appended: list[NDArray[Any]] = []
+    position = content.arrays[POSITION]
     arrays = {name: array for name, array in content.arrays.items() if name != POSITION}
     lines = lines_of(arrays["track"]) if "track" in arrays else np.zeros(1, np.int64)
-    data = "".join(appended.element(name, array, content.units[name]) for name, array in arrays.items())
-    points = appended.element("Points", position, content.units[POSITION])
+    data = "".join(_element(appended, name, array, content.units[name]) for name, array in arrays.items())
+    points = _element(appended, "Points", position, content.units[POSITION])
     vertices = _cells("Verts", np.arange(len(position) + 1), appended)
     body = (
         f'<PolyData>\n{_field_data(content)}<Piece NumberOfPoints="{len(position)}" NumberOfVerts="{len(position)}" '
@@ -92,10 +85,10 @@ def write_vtp(path: Path, content: Content) -> None:
     _write(path, "PolyData", body, appended)
 
 
-def _cells(name: str, begins: NDArray[np.int64], appended: _Appended) -> str:
+def _cells(name: str, begins: NDArray[np.int64], appended: list[NDArray[Any]]) -> str:
     """Return the element of cells of consecutive points, each of which begins where the one before ends."""
-    connectivity = appended.element("connectivity", np.arange(begins[-1], dtype=np.int64))
-    offsets = appended.element("offsets", begins[1:].astype(np.int64))
+    connectivity = _element(appended, "connectivity", np.arange(begins[-1], dtype=np.int64))
+    offsets = _element(appended, "offsets", begins[1:].astype(np.int64))
     return f"<{name}>\n{connectivity}{offsets}</{name}>\n"
 
 
@@ -115,14 +108,14 @@ def _field_data(content: Content) -> str:
     return f"<FieldData>\n{''.join(fields)}</FieldData>\n"
 
 
-def _write(path: Path, kind: str, body: str, appended: _Appended) -> None:
+def _write(path: Path, kind: str, body: str, appended: list[NDArray[Any]]) -> None:
     head = (
         f'<?xml version="1.0"?>\n<VTKFile type="{kind}" version="1.0" byte_order="LittleEndian" '
         f'header_type="UInt64">\n{body}<AppendedData encoding="raw">\n_'
     )
     with open(path, "wb") as file:
         file.write(head.encode())
-        for array in appended.arrays:
+        for array in appended:
             file.write(np.array(array.nbytes, LENGTH).tobytes())
             file.write(array.tobytes())
         file.write(b"\n</AppendedData>\n</VTKFile>\n")
@@ -147,7 +140,7 @@ def write_playback(path: Path, tracks: PointRows, frames: int, dt_s: float, *, o
     count = int(counts.sum())
     units = UNITS[TRAJECTORIES_FORMAT]
 
-    def fill(file: h5py.File) -> None:
+    with created(path, overwrite=overwrite) as file:
         write_root(file, PLAYBACK_FORMAT, PLAYBACK_VERSION, tracks.reference, tracks.attributes, tracks.provenance)
         vtk = create_vtk_group(file, None)
         write_rows(vtk, "Points", count, rows(POSITION), "mm")
@@ -172,8 +165,6 @@ def write_playback(path: Path, tracks: PointRows, frames: int, dt_s: float, *, o
         of_kinds[:, 0] = before
         write_array(steps, "CellOffsets", of_kinds)
         write_array(steps, "ConnectivityIdOffsets", of_kinds)
-
-    create(path, fill, overwrite=overwrite)
 
 
 SERIES_FORMAT, SERIES_VERSION = "lfpiv-series", 1
@@ -210,7 +201,7 @@ def write_series(
     of_one = count == 1  # VTK takes one step for none, and its axis for one of the place
     times, unit = (list(map(float, range(count))), "frame") if times_s is None else (times_s, "s")
 
-    def fill(file: h5py.File) -> None:
+    with created(path, overwrite=overwrite) as file:
         told = {name: np.asarray(value) if isinstance(value, list) else value for name, value in others.items()}
         write_root(file, SERIES_FORMAT, SERIES_VERSION, reference, told, provenance)
         vtk = create_vtk_group(file, grid)
@@ -227,5 +218,3 @@ def write_series(
         for number in range(count):
             for name, array in read(number).arrays.items():
                 points[name][... if of_one else number] = array[0] if array.shape[0] == 1 else array
-
-    create(path, fill, overwrite=overwrite)

@@ -24,8 +24,21 @@ from numpy.typing import NDArray
 
 from lfpiv_cli.errors import InputError, UsageError
 from lfpiv_cli.files.inputs import content_of, ensure_regular_file, opened, reading_from, reason
-from lfpiv_cli.files.recordings.blocks import COLOUR_HINT, PACKED_BITS, Pixels, at_rate, bytes_at, recording, values_at
-from lfpiv_cli.files.recordings.recording import CUT, Image, Recording, Shape, as_counts, ensure_size
+from lfpiv_cli.files.recordings.recording import (
+    COLOUR_HINT,
+    CUT,
+    PACKED_BITS,
+    Image,
+    Pixels,
+    Recording,
+    Shape,
+    as_counts,
+    at_rate,
+    bytes_at,
+    ensure_size,
+    recording,
+    values_at,
+)
 
 # Photron's .mraw: frames one after the other, and a header in a file beside it, .cihx (XML) or .cih (text).
 
@@ -304,28 +317,23 @@ def im7_frames(path: Path) -> Recording:
     def read_page(page: int, shape: Shape | None) -> Image:
         with opened(path) as file:
             ensure_size(f"{path}: frame {page}", declared, 1, shape, file.seek(0, 2))
-            if packing == ZLIB:
-                data = _unpacked(path, file, pages, frame_bytes)[page * frame_bytes : (page + 1) * frame_bytes]
-            else:
+            if packing == NOT_PACKED:
                 data = bytes_at(path, file, IM7_HEADER_BYTES + page * frame_bytes, frame_bytes)
+            else:
+                # All frames, whose check sum tells damage: one byte more than there should be shows that it is there.
+                (length,) = values_at(path, file, IM7_HEADER_BYTES, PACKED_LENGTH)
+                packed = bytes_at(path, file, IM7_HEADER_BYTES + PACKED_LENGTH_BYTES, length)
+                unpacking = zlib.decompressobj()
+                try:
+                    whole = unpacking.decompress(packed, pages * frame_bytes + 1)
+                except zlib.error as error:
+                    raise InputError(f"{path}: cannot be unpacked: {reason(error)}: {CUT}") from error
+                if len(whole) != pages * frame_bytes or not unpacking.eof:
+                    raise InputError(f"{path}: does not unpack to {pages} frames of {frame_bytes} bytes: {CUT}")
+                data = whole[page * frame_bytes : (page + 1) * frame_bytes]
         return as_counts(np.frombuffer(data, counts).reshape(declared))
 
     return Recording(pages, declared, 8 * counts.itemsize, read_page)
-
-
-def _unpacked(path: Path, file: BinaryIO, pages: int, frame_bytes: int) -> bytes:
-    """Return the bytes of all frames, whose check sum tells damage."""
-    (length,) = values_at(path, file, IM7_HEADER_BYTES, PACKED_LENGTH)
-    packed = bytes_at(path, file, IM7_HEADER_BYTES + PACKED_LENGTH_BYTES, length)
-    unpacking = zlib.decompressobj()
-    try:
-        # One byte more than there should be, and the check sum after it is looked at.
-        data = unpacking.decompress(packed, pages * frame_bytes + 1)
-    except zlib.error as error:
-        raise InputError(f"{path}: cannot be unpacked: {reason(error)}: {CUT}") from error
-    if len(data) != pages * frame_bytes or not unpacking.eof:
-        raise InputError(f"{path}: does not unpack to {pages} frames of {frame_bytes} bytes: {CUT}")
-    return data
 
 
 # The .set: a text, and beside it a folder of its name with the set's images B00001.im7, B00002.im7, ... The text tells

@@ -1,4 +1,8 @@
-"""Greyscale TIFF, one frame a page, and PNG, one a file: refused rather than guessed where anything is odd."""
+"""Frames in the formats of any program, refused rather than guessed where anything is odd.
+
+Greyscale TIFF has one frame a page, PNG one a file. HDF5 has a dataset (frames, rows, columns), named as FILE.h5:/PATH,
+or the only one of three axes; a dataset `time_s` with a number for each frame beside it has their times.
+"""
 
 from __future__ import annotations
 
@@ -12,11 +16,13 @@ from functools import partial
 from pathlib import Path
 from typing import BinaryIO
 
+import h5py
 import imagecodecs
 import numpy as np
 import tifffile
 
 from lfpiv_cli.errors import InputError, LfpivError
+from lfpiv_cli.files.hdf5 import items_in, member, open_h5
 from lfpiv_cli.files.inputs import reason
 from lfpiv_cli.files.recordings.recording import (
     CUT,
@@ -55,7 +61,7 @@ def png_frames(path: Path) -> Recording:
 
 def _read_png(path: Path, page: int, shape: Shape | None) -> Image:
     """Read a PNG file after checking its header and the check sums of all its parts."""
-    try:
+    with _naming(path):
         declared, size = png_frames(path).shape, path.stat().st_size
         ensure_size("the image", declared, 1, shape, size)
         if size > HARMLESS_BYTES + MOST_BYTES_A_PIXEL * math.prod(declared):
@@ -82,10 +88,6 @@ def _read_png(path: Path, page: int, shape: Shape | None) -> Image:
         if array.shape[:2] != (rows, columns):
             raise InputError(f"decodes to {array.shape}, it declares {rows, columns}")
         return as_counts(one_channel(array, "the image"))
-    except LfpivError as error:
-        raise type(error)(f"{path}: {error}") from error
-    except Exception as error:  # a damaged file can raise anything inside the decoder
-        raise InputError(f"{path}: cannot be decoded: {reason(error)}") from error
 
 
 def _parts(content: bytes) -> Iterator[tuple[bytes, bytes]]:
@@ -184,7 +186,7 @@ def _next_directory(file: BinaryIO, size: int, offset: int, page: int, order: st
     return following
 
 
-STARTS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
+TIFF_STARTS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 # Photometric interpretations: of a greyscale TIFF whose zeros are black, and of colours.
 BLACK_IS_ZERO, RGB, PALETTE = 1, 2, 3
 # TIFF's palettes hold 16-bit colours for indices of 8 bits.
@@ -197,7 +199,7 @@ BLACK_AND_WHITE = (2, 3, 4, 32771)
 SEPARATE = 2
 
 
-def frames(path: Path) -> Recording:
+def tiff_frames(path: Path) -> Recording:
     """Return the pages of a TIFF file whose directories are sound."""
     with _naming(path), open(path, "rb") as file:
         places = directories(file, path.stat().st_size)
@@ -215,11 +217,11 @@ def frames(path: Path) -> Recording:
                 )
             bits = first.bitspersample if isinstance(first.bitspersample, int) else first.bitspersample[0]
             return Recording(
-                len(places), (first.imagelength, first.imagewidth), bits, partial(_read_page, path, places)
+                len(places), (first.imagelength, first.imagewidth), bits, partial(_read_tiff, path, places)
             )
 
 
-def _read_page(path: Path, places: Sequence[int], number: int, shape: Shape | None) -> Image:
+def _read_tiff(path: Path, places: Sequence[int], number: int, shape: Shape | None) -> Image:
     """Read the page whose directory lies at `places[number]`, after checking what it declares.
 
     The chain of directories is not walked again.
@@ -288,3 +290,88 @@ def _ensure_segments(page: tifffile.TiffPage, number: int, file_bytes: int) -> N
             raise InputError(
                 f"strip or tile {segment} of page {number} has {length} bytes, its pixels take {pixels}: {CUT}"
             )
+
+
+# Datasets of HDF5.
+
+HDF5_START = b"\x89HDF\r\n\x1a\n"
+TIMES = "time_s"
+# A chunk is unpacked whole for each frame in it; cameras' programs write a frame or a few in each.
+MOST_CHUNK_BYTES = 2**28
+# Names of datasets that an error lists.
+MOST_LISTED = 5
+
+
+def hdf5_frames(path: Path, name: str | None = None) -> Recording:
+    """Return the frames of a dataset, of one with two dimensions the only frame; by default of the only one of three.
+
+    Raises
+    ------
+    InputError : there is no such dataset, there are several, or it is a file of ours
+    """
+    with open_h5(path) as file:
+        if name is not None:
+            return _frames_in(path, _dataset(path, file, name))
+        if "format" in file.attrs and "provenance" in file.attrs:
+            raise InputError(f"{path}: is a result of this program, expected images")
+        arrays = [item for item in items_in(file) if isinstance(item, h5py.Dataset) and item.dtype.kind in "uif"]
+        names = [array.name for array in arrays if array.ndim == 3]
+        if len(names) != 1:
+            listed = ", ".join(f"{path.name}:{name}" for name in names[:MOST_LISTED])
+            raise InputError(
+                f"{path}: holds {len(names)} datasets of frames, expected one, or to be told which"
+                + (f": {listed}" if names else "")
+            )
+        return _frames_in(path, file[names[0]])
+
+
+def _dataset(path: Path, file: h5py.File, name: str) -> h5py.Dataset:
+    """Return a dataset by its path of hard links."""
+    found: h5py.Group | h5py.Dataset = file
+    for part in name.strip("/").split("/"):
+        if not isinstance(found, h5py.Group) or part not in found:
+            raise InputError(f"{path}: holds no dataset {name}")
+        found = member(found, part)
+    if not isinstance(found, h5py.Dataset):
+        raise InputError(f"{path}: {name} is a group, expected a dataset of frames")
+    return found
+
+
+def _frames_in(path: Path, dataset: h5py.Dataset) -> Recording:
+    """Return the frames of a dataset whose bytes are all in this very file, with the times beside it."""
+    name = dataset.name
+    if dataset.is_virtual or dataset.external:
+        raise InputError(f"{path}: {name} lies in another file")
+    if dataset.shape is None or dataset.ndim not in (2, 3) or dataset.dtype.kind not in "uif" or not dataset.size:
+        raise InputError(
+            f"{path}: {name} is {dataset.dtype} {dataset.shape}, expected numbers of (frames, rows, columns)"
+        )
+    shape, item_bytes = (int(dataset.shape[-2]), int(dataset.shape[-1])), dataset.dtype.itemsize
+    ensure_size(f"{path}: a frame of {name}", shape, item_bytes, None, path.stat().st_size)
+
+    # Parts that were never written would be read as zeros.
+    if dataset.chunks is None:
+        stored = dataset.id.get_storage_size()
+        if stored < dataset.size * item_bytes:
+            raise InputError(f"{path}: {name} has {stored} of its {dataset.size * item_bytes} bytes: {CUT}")
+    else:
+        if math.prod(dataset.chunks) * item_bytes > MOST_CHUNK_BYTES:
+            raise InputError(f"{path}: {name} has chunks of {dataset.chunks}, more than {MOST_CHUNK_BYTES} bytes each")
+        expected = math.prod(-(-n // c) for n, c in zip(dataset.shape, dataset.chunks, strict=True))
+        found = dataset.id.get_num_chunks()
+        if found != expected:
+            raise InputError(f"{path}: {name} has {found} of its {expected} chunks: {CUT}")
+
+    pages, time_s = int(dataset.shape[0]) if dataset.ndim == 3 else 1, None
+    times = member(dataset.parent, TIMES) if TIMES in dataset.parent else None
+    if isinstance(times, h5py.Dataset) and times.shape == (pages,) and times.dtype.kind in "uif":
+        told = np.asarray(times[()], np.float64)
+        time_s = told if np.isfinite(told).all() else None
+    return Recording(pages, shape, 8 * item_bytes, partial(_read_dataset, path, name), time_s)
+
+
+def _read_dataset(path: Path, name: str, page: int, shape: Shape | None) -> Image:
+    with open_h5(path) as file:
+        dataset = _dataset(path, file, name)
+        ensure_size(f"{path}: frame {page}", dataset.shape[-2:], dataset.dtype.itemsize, shape, path.stat().st_size)
+        return as_counts(dataset[page] if dataset.ndim == 3 else dataset[()])
