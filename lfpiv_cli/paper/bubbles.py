@@ -214,24 +214,14 @@ def _drawings(work: Work, methods: Mapping[str, Measured], duct: Duct) -> tuple[
     plane = int(np.argmax(np.where(beside_wall(without, duct), np.nan_to_num(error), 0.0).sum(axis=(1, 2))))
     depth = float((without.field.grid.axis_mm(2)[plane] - duct.position_mm(2, 0.0)) / duct.width_mm)
     return (
-        Drawing(
-            "raw",
-            "A piece of a raw image with bubbles on the wall (after Fig. 17), and what the mask leaves out: pixels "
-            "that are in both images brighter than anything that moves, and those within one microlens of them.",
-            raw_figure(_pair(work)[0][shown], mask[shown]),
-        ),
+        Drawing.of("raw", raw_figure, _pair(work)[0][shown], mask[shown]),
         Drawing(
             "vectors",
             f"Vectors and errors in the plane at z/D = {depth:.2f}, in which most is spoilt beside the wall; "
             f"beyond the dashed line, x/D = {PAPERS_WALL:g}, the paper's velocities are too small. Blank: no vector.",
             plane_figure(methods, duct, plane),
         ),
-        Drawing(
-            "profile",
-            "Means over flow and depth of the velocity along the flow (after Fig. 16a), and their errors; grey is "
-            "where the paper's velocities are too small.",
-            wall_profile_figure(methods, duct),
-        ),
+        Drawing.of("profile", wall_profile_figure, methods, duct),
     )
 
 

@@ -185,7 +185,11 @@ def table2(work: Work) -> Findings:
 
 @styled
 def focal_plane_figure(focal_error_mm: NDArray, off_mm: NDArray, sigma_mm: NDArray) -> Figure:
-    """Return the error of the mid plane's place (n,) with its standard error over how far the focus was off, mm."""
+    """Where one snapshot puts the mid plane of the channel, less where it is, over how far the camera was focused away
+    from the board (Eq. 21). Bars: the stated standard error.
+
+    Arrays (n,), mm.
+    """
     figure, axes = new_panels(6.5, 3.6)
     axes.errorbar(focal_error_mm, 1e3 * off_mm, 1e3 * sigma_mm, fmt="o", color=BLUE, capsize=3)
     axes.axhline(0.0, color="0.6", linewidth=0.8)
@@ -223,14 +227,7 @@ def focal_plane(work: Work) -> Findings:
             Row("place of the mid plane, largest error (mm)", "Eq. 21", LIMIT_MM, best=float(np.abs(off).max())),
             Row("the same, in stated standard errors", "Eq. 21", LIMIT_SIGMAS, best=float(np.abs(off / sigma).max())),
         ),
-        drawings=(
-            Drawing(
-                "mid_plane",
-                "Where one snapshot puts the mid plane of the channel, less where it is, over how far the camera was "
-                "focused away from the board (Eq. 21). Bars: the stated standard error.",
-                focal_plane_figure(errors_mm, off, sigma),
-            ),
-        ),
+        drawings=(Drawing.of("mid_plane", focal_plane_figure, errors_mm, off, sigma),),
         tables=(Table("Mid plane from the focal plane (mm)", DEPTHS_HEAD, rows),),
         text=(
             "The board lies on the outer wall of the channel and the camera is meant to be focused on it. Here it is "

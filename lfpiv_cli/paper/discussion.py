@@ -30,7 +30,8 @@ from lfpiv_cli.weights.build import default_padding, factorise
 
 @styled
 def depth_resolution_figure(told: Mapping[str, Any], geometric_mm: float, lens_mm: float) -> Figure:
-    """Return lengths and errors over depth, mm, on one logarithmic scale.
+    """What depth can be told to, over depth: the length of a tracer reconstructed by SART, the depth in which the
+    outermost views move by one microlens, and the Cramer-Rao bound of a tracer's place.
 
     Parameters
     ----------
@@ -52,7 +53,11 @@ def depth_resolution_figure(told: Mapping[str, Any], geometric_mm: float, lens_m
 
 @styled
 def seeding_bound_figure(told: Mapping[str, Any], papers_per_lens: float) -> Figure:
-    """Return the bound of places, `sigma_mm` (n, 3), over the tracers `per_lens` (n,), with the paper's seeding."""
+    """The Cramer-Rao bound of a tracer among others that are to be found as well, median, over how many there are; the
+    line is the paper's seeding.
+
+    `sigma_mm` is (n, 3), `per_lens` (n,).
+    """
     figure, axes = new_panels(6.5, 3.8)
     sigma = 1e3 * np.array(told["sigma_mm"])
     axes.loglog(told["per_lens"], sigma[:, 2], "o-", color=BLUE, label="depth")
@@ -154,18 +159,8 @@ def discussion(work: Work) -> Findings:
     sigma = np.array(told["sigma_mm"])
     return Findings(
         drawings=(
-            Drawing(
-                "depth",
-                "What depth can be told to, over depth: the length of a tracer reconstructed by SART, the depth in "
-                "which the outermost views move by one microlens, and the Cramer-Rao bound of a tracer's place.",
-                depth_resolution_figure(told, geometric, float(camera.scale(media).lens_mm)),
-            ),
-            Drawing(
-                "seeding",
-                "The Cramer-Rao bound of a tracer among others that are to be found as well, median, over how many "
-                "there are; the line is the paper's seeding.",
-                seeding_bound_figure(crowd, PAPERS_PPP / per_pixel),
-            ),
+            Drawing.of("depth", depth_resolution_figure, told, geometric, float(camera.scale(media).lens_mm)),
+            Drawing.of("seeding", seeding_bound_figure, crowd, PAPERS_PPP / per_pixel),
         ),
         tables=(_table(told),),
         text=(

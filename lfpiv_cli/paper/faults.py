@@ -47,7 +47,11 @@ DECADES = (-1.0, 3.0)
 
 @styled
 def faults_figure(over: Mapping[str, Mapping[str, float]], words: Mapping[str, str]) -> Figure:
-    """Return a table in colours of figures over their limits: a row for each measurement, a column for each figure."""
+    """How far each figure of a measurement is off, over its limit, without a mistake and with a planted one. Numbers
+    above 1 miss it.
+
+    A row for each measurement, a column for each figure.
+    """
     names = list(words)
     table = np.array([[each[name] for name in names] for each in over.values()])
     shade = np.clip(np.log10(np.maximum(table, 10.0 ** DECADES[0])), *DECADES)
@@ -162,14 +166,7 @@ def faults(work: Work) -> Findings:
     over = {name: over_limits(each, limits) for name, each in {"no mistake": good_figures, **figures}.items()}
     return Findings(
         rows=fault_rows(figures, good_figures, limits),
-        drawings=(
-            Drawing(
-                "faults",
-                "How far each figure of a measurement is off, over its limit, without a mistake and with a planted "
-                "one. Numbers above 1 miss it.",
-                faults_figure(over, {name: words.text for name, words in WORDS.items()}),
-            ),
-        ),
+        drawings=(Drawing.of("faults", faults_figure, over, {name: words.text for name, words in WORDS.items()}),),
         tables=(fault_table(figures, good_figures, limits),),
         text=(
             f"{len(planted)} mistakes are planted, each in a measurement that is good otherwise: a pair of images of "

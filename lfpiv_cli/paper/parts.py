@@ -18,7 +18,7 @@ from lfpiv_cli.files.atomic import write_json, write_text
 from lfpiv_cli.files.inputs import ensure_regular_file, reason
 from lfpiv_cli.files.pages import Table
 from lfpiv_cli.names import Size
-from lfpiv_cli.pictures.style import Figure
+from lfpiv_cli.pictures.style import Figure, caption_of
 
 TABLE_2: dict[str, Any] = {
     "camera": {
@@ -114,6 +114,11 @@ class Drawing:
     name: str
     caption: str
     figure: Figure
+
+    @classmethod
+    def of(cls, name: str, draw: Callable[..., Figure], *given: Any) -> Drawing:
+        """Return what a function draws, which says the caption in its first paragraph."""
+        return cls(name, caption_of(draw), draw(*given))
 
 
 @dataclass(frozen=True, eq=False)

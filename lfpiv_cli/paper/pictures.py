@@ -54,7 +54,11 @@ def board_view(volume: Singles, grid: Grid) -> dict[str, Floats]:
 
 @style.styled
 def views_figure(views: Mapping[str, Mapping[str, Floats]]) -> style.Figure:
-    """Return boards in the focal plane, a row for each method: front, side and in three dimensions (Fig. 8)."""
+    """The board in the focal plane (after Fig. 8): the largest intensity along z and along y, and the voxels that are
+    brighter than 1/e of the brightest. One scale of intensity.
+
+    A row for each method.
+    """
     figure = style.new_figure(11.0, 3.7 * len(views))
     # as much of the depth for each as shows the longest dots and their surroundings
     reach = SHOWN_DEPTHS * max(float(np.abs(view["bright_mm"][:, 2]).max()) for view in views.values())
@@ -144,7 +148,10 @@ def location_figure(
 
 @style.styled
 def centres_figure(centres_mm: Mapping[str, Floats]) -> style.Figure:
-    """Return the centres of all dots of all boards, (n, 3) for each method, coloured by depth (Fig. 10)."""
+    """Centres of all dots of all boards (after Fig. 10).
+
+    Centres are (n, 3) for each method, coloured by depth.
+    """
     figure = style.new_figure(5.2 * len(centres_mm) + 0.8, 4.2)
     deepest = max(float(np.abs(each[:, 2]).max()) for each in centres_mm.values())
     for number, (label, each) in enumerate(centres_mm.items(), start=1):
@@ -177,7 +184,11 @@ WAY_STYLES = ((style.VERMILION, "s", "--"), (style.BLUE, "o", "-."), (style.GREE
 
 @style.styled
 def slice_maps_figure(methods: Mapping[str, Measured], duct: Duct) -> style.Figure:
-    """Return the size of the velocity in the six slices (columns), true and by each way (rows), on one scale."""
+    """Size of the velocity in the paper's slices (after Fig. 15), one colour scale: across the depth at z/D = 0.3,
+    0.54, 0.78, and across x at x/D = 0.24, 0.48, 0.72. Columns are slices, rows are ways to measure.
+
+    The first row is the truth.
+    """
     first = next(iter(methods.values()))
     rows = {"true": (first, first.truth)} | {name: (m, m.field.velocity) for name, m in methods.items()}
     highest = max(float(np.linalg.norm(m.truth[m.inside], axis=-1).max()) for m in methods.values())
@@ -201,7 +212,9 @@ def slice_maps_figure(methods: Mapping[str, Measured], duct: Duct) -> style.Figu
 
 @style.styled
 def cumulative_figure(methods: Mapping[str, Measured]) -> style.Figure:
-    """Return the share of vectors over their relative error, along the flow and of the whole vector, with the 25 %."""
+    """Share of all vectors that err by less than what the axis says (after Fig. 18): in the velocity along the flow, as
+    the paper has it, and in the whole vector, depth included.
+    """
     figure, panels = style.new_panels(10.0, 4.2, 1, 2, sharey=True)
     for (name, m), (colour, _, line) in zip(methods.items(), WAY_STYLES, strict=False):
         shares = cumulative_distribution(m.pairs)
@@ -230,7 +243,9 @@ CASE_STYLES = ((style.BLUE, "o"), (style.VERMILION, "s"), (style.GREEN, "^"), (s
 
 @style.styled
 def raw_figure(image: Singles, mask: Flags) -> style.Figure:
-    """Return a part of a raw image with bubbles, alone and with the outline of what a mask leaves out."""
+    """A piece of a raw image with bubbles on the wall (after Fig. 17), and what the mask leaves out: pixels that are in
+    both images brighter than anything that moves, and those within one microlens of them.
+    """
     figure, panels = style.new_panels(10.0, 10.0 * 0.5 * image.shape[0] / image.shape[1] + 1.0, 1, 2)
     highest = float(np.percentile(image[~mask], 99.9)) if not mask.all() else float(image.max())
     for axes, title in zip(panels, ("raw image", "left out by the mask"), strict=True):
@@ -277,7 +292,9 @@ def plane_figure(methods: Mapping[str, Measured], duct: Duct, plane: int) -> sty
 
 @style.styled
 def wall_profile_figure(methods: Mapping[str, Measured], duct: Duct) -> style.Figure:
-    """Return the mean over flow and depth of the velocity along the flow, over x/D, and its error beside it."""
+    """Means over flow and depth of the velocity along the flow (after Fig. 16a), and their errors; grey is where the
+    paper's velocities are too small.
+    """
     figure, (left, right) = style.new_panels(10.0, 4.2, 1, 2)
     axis = duct.across["x/D"]
     first = next(iter(methods.values()))

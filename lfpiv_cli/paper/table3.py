@@ -250,19 +250,14 @@ def _drawings(
     }
     steps = PAPERS_STEPS_MM[half]
     return (
-        Drawing(
-            "board",
-            "The board in the focal plane (after Fig. 8): the largest intensity along z and along y, and the voxels "
-            "that are brighter than 1/e of the brightest. One scale of intensity.",
-            views_figure(views),
-        ),
+        Drawing.of("board", views_figure, views),
         Drawing(
             "elongation",
             f"Elongation of the dots by depth, mean and standard deviation over the dots (after {lengths}). Grey: the "
             "range that the paper gives.",
             elongation_figure(named, PAPERS_ELONGATION_MM[half], PAPERS_SPREAD_MM[half]),
         ),
-        Drawing("centres", "Centres of all dots of all boards (after Fig. 10).", centres_figure(centres)),
+        Drawing.of("centres", centres_figure, centres),
         Drawing(
             "places",
             f"Lateral spacing and separation in depth, and their errors (after {places})."

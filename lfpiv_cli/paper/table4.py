@@ -320,24 +320,14 @@ def _setup(size: ChannelSize) -> Table:
 
 def _drawings(methods: Mapping[str, Measured], duct: Duct) -> tuple[Drawing, ...]:
     return (
-        Drawing(
-            "slices",
-            "Size of the velocity in the paper's slices (after Fig. 15), one colour scale: across the depth at z/D = "
-            "0.3, 0.54, 0.78, and across x at x/D = 0.24, 0.48, 0.72. Columns are slices, rows are ways to measure.",
-            slice_maps_figure(methods, duct),
-        ),
+        Drawing.of("slices", slice_maps_figure, methods, duct),
         Drawing(
             "profiles",
             "Profiles of the mean velocity along the flow in the paper's slices (after Fig. 16), means along the flow; "
             "lines are the analytic flow.",
             slices_figure(methods, duct),
         ),
-        Drawing(
-            "cumulative",
-            "Share of all vectors that err by less than what the axis says (after Fig. 18): in the velocity along the "
-            "flow, as the paper has it, and in the whole vector, depth included.",
-            cumulative_figure(methods),
-        ),
+        Drawing.of("cumulative", cumulative_figure, methods),
     )
 
 

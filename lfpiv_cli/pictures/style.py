@@ -6,8 +6,9 @@ again once it returns. matplotlib is imported inside: it is an optional extra, a
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable
-from functools import wraps
+from functools import partial, wraps
 from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
 
 import numpy as np
@@ -69,6 +70,12 @@ def styled(draw: Callable[P, R]) -> Callable[P, R]:
             return draw(*args, **kwargs)
 
     return drawn
+
+
+def caption_of(draw: Callable[..., Any]) -> str:
+    """Return what a figure shows, as the function that draws it says in its first paragraph."""
+    said = inspect.getdoc(draw.func if isinstance(draw, partial) else draw) or ""
+    return " ".join(said.split("\n\n")[0].split())
 
 
 def new_figure(width: float, height: float) -> Figure:

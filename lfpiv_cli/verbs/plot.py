@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
@@ -28,6 +27,7 @@ from lfpiv_cli.notice import written
 from lfpiv_cli.pictures import calibration as of_calibration
 from lfpiv_cli.pictures import points as of_points
 from lfpiv_cli.pictures import vectors as of_vectors
+from lfpiv_cli.pictures.style import caption_of
 from lfpiv_cli.verbs.frames import residual_path
 
 if TYPE_CHECKING:
@@ -249,13 +249,7 @@ def figures_of(path: Path, raw: Path | None = None) -> dict[str, Drawn]:
     if raw is not None and of_format not in ON_IMAGES:
         raise UsageError(f"--raw: figures of {of_format} show no image, only {' and '.join(ON_IMAGES)} do")
     found = ON_IMAGES[of_format](path, raw) if of_format in ON_IMAGES else READERS[of_format](path)
-    return {name: each if isinstance(each, Drawn) else Drawn(_caption_of(each), each) for name, each in found.items()}
-
-
-def _caption_of(draw: Callable[[], Figure]) -> str:
-    """Return what a figure shows, as the function that draws it says in its first paragraph."""
-    said = inspect.getdoc(draw.func if isinstance(draw, partial) else draw) or ""
-    return " ".join(said.split("\n\n")[0].split())
+    return {name: each if isinstance(each, Drawn) else Drawn(caption_of(each), each) for name, each in found.items()}
 
 
 def plot(
