@@ -385,7 +385,7 @@ def polynomial_fit(
     variables = np.concatenate([start_mm, crossing_mm], axis=1)
     scale = np.maximum(np.abs(variables).max(axis=0), float(camera.lattice.pitch.min()))
     exponents = complete_exponents(degree)
-    terms = polynomial_terms(variables / scale, exponents)
+    terms = np.ascontiguousarray(polynomial_terms(variables / scale, exponents))
     used = np.ones(len(terms), dtype=bool)
     for _ in range(FIT_ROUNDS):
         coefficients = np.asarray(np.linalg.lstsq(terms[used], array_mm[used], rcond=None)[0], dtype=np.float64)

@@ -64,7 +64,7 @@ class PolynomialRays:
     def on_array(self, start_mm: ArrayLike, crossing_mm: ArrayLike) -> Floats:
         """Return where rays from (n, 3) through (n, 2) meet the array, (n, 2)."""
         rays = np.concatenate([np.atleast_2d(start_mm), np.atleast_2d(crossing_mm)], axis=1) / self.scale_mm
-        return polynomial_terms(rays, self.exponents) @ self.coefficients_mm
+        return np.ascontiguousarray(polynomial_terms(rays, self.exponents)) @ self.coefficients_mm
 
 
 def polynomial_terms(variables: Floats, exponents: Integers) -> Floats:
