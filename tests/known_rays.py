@@ -9,10 +9,10 @@ from numpy.typing import ArrayLike
 from lfpiv_cli.arrays import Flags, Floats
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.curved_space import ROUNDING_MM, CurvedSpace, in_fluid, refracted, trace_in
-from lfpiv_cli.optics.media import Media, Window, equivalent_object_distance, fluid_path_to_focus, object_space_matrix
+from lfpiv_cli.optics.media import Media, Window, equivalent_object_distance, fluid_path_to_focus
 from lfpiv_cli.optics.shapes import Vector, dot, plus, scaled
 from lfpiv_cli.optics.surfaces import Faces, meet
-from lfpiv_cli.optics.tracing import exact_slope
+from lfpiv_cli.optics.tracing import disc_points, exact_slope, trace
 
 
 def slopes_equivalent(points: Floats, lens: Floats, camera: Camera, media: Media) -> Floats:
@@ -21,14 +21,19 @@ def slopes_equivalent(points: Floats, lens: Floats, camera: Camera, media: Media
     return (lens - points[:, :2]) / distance[:, np.newaxis]
 
 
-def slopes_direct(points: Floats, lens: Floats, camera: Camera, media: Media, window: Window) -> Floats:
-    """Return the slopes (n, 2) at the main lens of rays traced through window and fluid, paraxially (Eqs. 14, 15)."""
-    slopes = np.empty_like(lens)
-    for i, (point, crossing) in enumerate(zip(points, lens, strict=True)):
-        matrix = object_space_matrix(point[2], window, camera.focus_distance_mm, media)
-        start = (crossing - matrix[0, 0] * point[:2]) / matrix[0, 1]
-        slopes[i] = matrix[1, 0] * point[:2] + matrix[1, 1] * start
-    return slopes
+def image_of(camera: Camera, sensor_mm: Floats, weights: float | Floats = 1.0) -> Floats:
+    """Count rays that end at places (n, 2) of the sensor into pixels, c reaching from c - 1/2 to c + 1/2."""
+    column, row = np.rint(camera.mm_to_px(sensor_mm)).astype(int).T
+    inside = (column >= 0) & (column < camera.columns) & (row >= 0) & (row < camera.rows)
+    image = np.zeros((camera.rows, camera.columns))
+    np.add.at(image, (row[inside], column[inside]), np.broadcast_to(weights, len(inside))[inside])
+    return image
+
+
+def points_counted(points: Floats, camera: Camera, media: Media, rng: np.random.Generator) -> Floats:
+    """Return the image of glowing points (n, 3), a ray of each, from the image's axes."""
+    lens = disc_points(len(points), camera.aperture_radius_mm, rng)
+    return image_of(camera, trace(camera, lens, slopes_equivalent(points, lens, camera, media)).sensor_mm)
 
 
 def slopes_exact(points: Floats, lens: Floats, camera: Camera, media: Media, window: Window) -> Floats:

@@ -1,7 +1,6 @@
 """Each list of names stands once: what configuration, commands, comments and documents say is held against it."""
 
-from __future__ import annotations
-
+import ast
 import re
 import subprocess
 import sys
@@ -11,9 +10,11 @@ from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
 
 import click
+import numpy as np
 import pytest
 
 from lfpiv_cli.cli.main import cli
+from lfpiv_cli.console import readable
 from lfpiv_cli.files.sections import Section
 from lfpiv_cli.files.sections_work import CorrelationSection, FlowSection, Sections
 from lfpiv_cli.names import (
@@ -34,6 +35,7 @@ from lfpiv_cli.names import (
     Weighting,
     names_in,
 )
+from lfpiv_cli.notice import written
 from lfpiv_cli.reconstruction.registry import PARTICLES, SOLVER_NAMES, SOLVERS
 from lfpiv_cli.synthetic.flows import FLOWS
 
@@ -136,10 +138,12 @@ def commands() -> Iterator[tuple[str, click.Command]]:
 KEYS = list(keys_with_names())
 
 
-def test_keys_with_names_are_found() -> None:
+def test_flows_and_keys_are_those_of_the_registry() -> None:
     found = {path for path, _, _ in KEYS}
     assert {("reconstruction", "solver"), ("weights", "method"), ("validation", "board", "methods")} <= found
     assert len(found) >= 14
+    assert set(flow_kinds()) == set(FLOWS)
+    assert all(re.search(rf"\b{kind}\b", explained(("simulation", "flow"))) for kind in FLOWS)
 
 
 @pytest.mark.parametrize(("path", "section", "names"), KEYS, ids=[".".join(path) for path, _, _ in KEYS])
@@ -147,11 +151,6 @@ def test_section_and_table2_explain_every_name(path: tuple[str, ...], section: t
     for text in (section.__doc__ or "", explained(path)):
         missing = [name for name in names if not re.search(rf"\b{name}\b", text)]
         assert not missing, f"{'.'.join(path)}: {missing} not in {text}"
-
-
-def test_flows_are_those_of_the_registry() -> None:
-    assert set(flow_kinds()) == set(FLOWS)
-    assert all(re.search(rf"\b{kind}\b", explained(("simulation", "flow"))) for kind in FLOWS)
 
 
 def test_options_offer_the_shared_names() -> None:
@@ -164,14 +163,8 @@ def test_options_offer_the_shared_names() -> None:
     assert offered == OPTIONS
 
 
-def test_texts_tell_which_solvers_have_an_exponent_of_their_own() -> None:
-    own = sorted(name for name, solver in SOLVERS.items() if solver.exponent != 1.0)
-    for text in (CorrelationSection.__doc__ or "", explained(("correlation", "exponent"))):
-        assert own in [sorted(words) for words in lists_in(text)], text
-
-
 def test_what_texts_list_are_names() -> None:
-    """A list of names that holds a word which is none has outlived a change, or was never right."""
+    # A list of names that holds a word which is none has outlived a change, or was never right.
     texts = {str(path.relative_to(ROOT)): path.read_text(encoding="utf-8") for path in (TABLE2, *DOCUMENTS)}
     texts |= {f"lfpiv {name}": command.help or "" for name, command in commands()}
     texts |= {section.__name__: section.__doc__ or "" for _, section, _ in KEYS}
@@ -179,20 +172,68 @@ def test_what_texts_list_are_names() -> None:
     assert len(listed) >= 4
     for place, words in listed:
         assert any(set(words) <= set(names) for names in LISTED), f"{place} lists {words}"
-
-
-def test_a_list_with_a_word_that_is_no_name_is_seen() -> None:
     assert list(lists_in("the default, em (here), `smart` and artt; sart")) == [["default", "em", "smart", "artt"]]
     assert not list(lists_in("sart, which the paper has; em"))
+    own = sorted(name for name, solver in SOLVERS.items() if solver.exponent != 1.0)
+    for text in (CorrelationSection.__doc__ or "", explained(("correlation", "exponent"))):
+        assert own in [sorted(words) for words in lists_in(text)], text
 
 
-@pytest.mark.parametrize("name", SOLVERS)
-def test_every_solver_has_its_step(name: str) -> None:
-    assert callable(SOLVERS[name].step())
-    assert name != PARTICLES
-
-
-def test_names_load_nothing_heavy() -> None:
+def test_every_solver_has_its_step_and_names_load_nothing_heavy() -> None:
+    assert all(callable(solver.step()) for solver in SOLVERS.values())
+    assert PARTICLES not in SOLVERS
     code = "import sys, lfpiv_cli.names, lfpiv_cli.reconstruction.registry; print(*sys.modules)"
     loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT).stdout
     assert not {"numpy", "numba", "pydantic", "scipy"} & set(loaded.split())
+
+
+PACKAGE = Path(__file__).parents[1] / "lfpiv_cli"
+# What becomes part of a file's name, or a number again.
+NOT_FOR_PEOPLE = {"paper/sensitivities.py", "pictures/vectors.py"}
+TABLE = [
+    (0.0, 3, "0"),
+    (-0.0, 3, "0"),
+    (110.0, 2, "110"),
+    (5e5, 2, "500000"),
+    (2345.0, 2, "2300"),
+    (99999.5, 3, "100000"),
+    (999999.0, 3, "1 million"),
+    (1.25e7, 3, "12.5 million"),
+    (-6.4e10, 2, "-64 billion"),
+    (2.5e12, 2, "2.5 trillion"),
+    (3.2e15, 2, "3.2 x 10^15"),
+    (0.5, 3, "0.5"),
+    (0.05004, 3, "0.05"),
+    (1.23e-5, 3, "0.0000123"),
+    (-2e-5, 2, "-0.00002"),
+    (4.56e-9, 2, "4.6 x 10^-9"),
+    (9.999, 3, "10"),
+    (1.5, 6, "1.5"),
+    (74915.7, 6, "74915.7"),
+    (1.0, 1, "1"),
+    (np.inf, 3, "inf"),
+    (np.nan, 3, "nan"),
+]
+
+
+def test_numbers_are_written_as_people_do_and_those_of_usual_size_as_python_does() -> None:
+    for value, digits, text in TABLE:
+        assert written(value, digits) == written(np.float32(value), digits) == text
+        assert readable([value, value], digits) == f"{text}, {text}"
+    for value in 10.0 ** np.linspace(-4.0, 2.99, 100):
+        assert written(value) == f"{value:.3g}"
+        assert written(-value) == f"{-value:.3g}"
+
+
+def test_no_text_has_numbers_that_computers_write() -> None:
+    # With few digits Python writes 110 as 1.1e+02, and with a fixed number of decimals -0.0001 as -0.000.
+    found = [
+        f"{name}: {ast.unparse(node)}"
+        for module in sorted(PACKAGE.rglob("*.py"))
+        if (name := module.relative_to(PACKAGE).as_posix()) not in NOT_FOR_PEOPLE
+        for node in ast.walk(ast.parse(module.read_text(encoding="utf-8")))
+        if isinstance(node, ast.FormattedValue)
+        and node.format_spec is not None
+        and re.search(r"\.\dg'$", ast.unparse(node.format_spec))
+    ]
+    assert not found

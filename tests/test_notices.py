@@ -1,10 +1,9 @@
 """Warnings: their one form, on the terminal, in JSON, in files and in Python; and planted faults that must be told."""
 
-from __future__ import annotations
-
 import json
 import re
 import warnings
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -24,7 +23,6 @@ from lfpiv_cli.calibration.sheet import (
     sheet_fit,
 )
 from lfpiv_cli.calibration.white import lens_image_width
-from lfpiv_cli.cli.main import cli
 from lfpiv_cli.console import Console
 from lfpiv_cli.errors import ConfigError, InputError
 from lfpiv_cli.files.batch import Target, pending
@@ -39,15 +37,13 @@ from lfpiv_cli.notice import Notice
 from lfpiv_cli.optics.camera import Camera, Lattice, thin_lens
 from lfpiv_cli.optics.media import Media, Window
 from lfpiv_cli.optics.tracing import refraction_error_mm, sine_error_mm
-from lfpiv_cli.reference import Reference
+from lfpiv_cli.reference import FOCAL_POINT
 from lfpiv_cli.verbs.build_weights import plan_of
 from lfpiv_cli.verbs.checks import doubt_notices, few_notices, still_notices
 from lfpiv_cli.verbs.tracers import light_notices
-from lfpiv_cli.verbs.tracks import Tracked
 from lfpiv_cli.verbs.weights_cost import cost_notices, cost_of
-from lfpiv_cli.weights.operators import FactorisedOperator
+from tests.commands import AT_FOCUS, CONFIG, ROOT, SAMPLE, run, sample_rig, told
 
-ROOT = Path(__file__).parent.parent
 SHAPE = (200, 240)
 PITCH_PX = 14.2
 RIG = """
@@ -76,16 +72,12 @@ def white(
     return (image + rng.normal(0.0, 50.0, SHAPE)).astype(np.uint16)
 
 
-def rig_in(folder: Path) -> Path:
-    (folder / "rig.yaml").write_text(RIG)
-    return folder / "rig.yaml"
-
-
 def codes(picture: NDArray[np.uint16], folder: Path) -> list[str]:
     """Return the codes of what is warned of a white image, from Python."""
+    (folder / "rig.yaml").write_text(RIG)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        lf.calibrate(picture, None, lf.load_rig(rig_in(folder)))
+        lf.calibrate(picture, None, lf.load_rig(folder / "rig.yaml"))
     assert all(each.filename == __file__ for each in caught)
     return [each.message.notice.code for each in caught if isinstance(each.message, lf.LfpivWarning)]
 
@@ -100,13 +92,17 @@ def test_documents_list_all_codes() -> None:
 
 
 @pytest.mark.thorough
-def test_a_warning_is_on_the_terminal_in_json_and_in_the_file(tmp_path: Path, capsys) -> None:
+def test_a_warning_is_on_the_terminal_in_json_and_in_the_file(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     write_tiff(tmp_path / "white.tif", white(radius_px=2.5), overwrite=False)
     output = tmp_path / "c.h5"
-    command = ["calibrate-snapshot", rig_in(tmp_path), "--white", tmp_path / "white.tif", "-o", output, "--overwrite"]
+    (tmp_path / "rig.yaml").write_text(RIG)
+    rig, white_tif = tmp_path / "rig.yaml", tmp_path / "white.tif"
+    command = ["calibrate-snapshot", rig, "--white", white_tif, "-o", output, "--overwrite"]
 
     def told(*options: str) -> Any:
-        cli.main([*(str(word) for word in command), *options], standalone_mode=False)
+        run(*command, *options)
         return capsys.readouterr()
 
     printed = told("--json")
@@ -122,21 +118,12 @@ def test_a_warning_is_on_the_terminal_in_json_and_in_the_file(tmp_path: Path, ca
     assert record is not None
     assert record["warnings"] == [warning]
     assert open_calibration(output).transmission is None
-    cli.main(["info", str(output), "--json"], standalone_mode=False)
+    run("info", output, "--json")
     (recorded,) = json.loads(capsys.readouterr().out)["warnings_recorded"]
     assert recorded == f"calibrate-snapshot: {line.removeprefix('lfpiv: warning: ').strip()}"
 
 
-def test_a_result_that_was_warned_of_is_not_made_again(tmp_path: Path) -> None:
-    target = Target(tmp_path / "a.vtkhdf", lambda: {"command": "track"})
-    made = with_warnings(target.record, [NOTICE])
-    assert made["warnings"] == [NOTICE.record()]
-    assert with_warnings(target.record, []) == target.record
-    write_tree(target.path, {}, format_name="lfpiv-tracks", format_version=1, provenance=made, overwrite=False)
-    assert pending([target], [], False, True) == []
-
-
-def test_a_console_collects_what_it_warns_of(capsys) -> None:
+def test_warnings_are_collected_and_recorded(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     warned: list[Notice] = []
     Console(quiet=True, warned=warned).warn([NOTICE])
     assert warned == [NOTICE]
@@ -144,6 +131,12 @@ def test_a_console_collects_what_it_warns_of(capsys) -> None:
     Console(only_warnings=True).warn([NOTICE])
     Console(only_warnings=True, verbose=True).detail("more")
     assert capsys.readouterr().err == "lfpiv: warning: a.vtkhdf: no tracks; look [no-tracks]\n"
+    target = Target(tmp_path / "a.vtkhdf", lambda: {"command": "track"})
+    made = with_warnings(target.record, [NOTICE])
+    assert made["warnings"] == [NOTICE.record()]
+    assert with_warnings(target.record, []) == target.record
+    write_tree(target.path, {}, format_name="lfpiv-tracks", format_version=1, provenance=made, overwrite=False)
+    assert pending([target], [], False, True) == []
 
 
 @pytest.mark.thorough
@@ -162,25 +155,31 @@ def test_faults_of_a_white_image_are_told(fault: dict[str, float], code: str | N
     assert codes(white(**fault), tmp_path) == ([] if code is None else [code])
 
 
-def test_what_is_no_lattice_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="off a lattice by .* not a white image"):
-        codes(white(jitter_px=0.09 * PITCH_PX), tmp_path)
-
-
-def test_width_of_lens_images() -> None:
+def test_width_of_lens_images_and_what_is_no_lattice(tmp_path: Path) -> None:
     lattice = Lattice.regular(PITCH_PX, "square", np.deg2rad(0.7), (117.3, 98.4))
     for radius in (2.5, 4.0, 6.0):
         # a disc's rim is a pixel wide, half of it beyond the radius
         found = lens_image_width(white(radius).astype(np.float32) - 200.0, lattice)
         assert found == pytest.approx(2.0 * radius / PITCH_PX, rel=0.03)
+    with pytest.raises(InputError, match="off a lattice by .* not a white image"):
+        codes(white(jitter_px=0.09 * PITCH_PX), tmp_path)
 
 
-def test_residual_that_is_refused_is_that_of_the_chosen_model(table2: Camera) -> None:
+def test_residuals_and_f_numbers_that_are_refused(table2: Camera) -> None:
+    # The residual is that of the chosen model.
     fit = replace(sheet_fit(table2), residual_px=np.full(2, 0.1), residual_affine_px=np.full(2, 2.0))
     check_residual(replace(fit, cubic_used=True))
     assert residual_share(fit) == pytest.approx(2.0 / fit.lattice_px.pitch[0])
     with pytest.raises(InputError):
         check_residual(fit)
+    assert table2.lens_image_width == pytest.approx(1.0)
+    for factor, count in ((0.85, 0), (1.2, 0), (1.67, 1), (0.6, 1)):
+        camera = replace(table2, aperture_mm=factor * table2.aperture_mm)
+        check_f_numbers(camera)
+        assert len(f_number_notices(camera)) == count
+    for factor in (3.1, 0.3):
+        with pytest.raises(ConfigError, match="aperture_mm: the main lens is f/"):
+            check_f_numbers(replace(table2, aperture_mm=factor * table2.aperture_mm))
 
 
 def fit_of(camera: Camera, stretch: float) -> Any:
@@ -190,16 +189,13 @@ def fit_of(camera: Camera, stretch: float) -> Any:
     return replace(fit, lattice_px=lattice, indices=np.zeros((100, 2), int), pitch_sigma_px=np.full(2, 1e-5))
 
 
-def test_lens_images_as_far_apart_as_the_lenses_say_nothing_is_off(table2: Camera) -> None:
+def test_image_distance_is_that_of_the_exit_pupil(table2: Camera) -> None:
     # telecentric towards the array: no excess of the pitch
     assert image_distance_notices(fit_of(table2, 1.0 / table2.micro_image_scale), table2) == []
     assert image_distance_notices(fit_of(table2, 1.0), table2) == []
     for stretch in (1.002, 0.99):
         (notice,) = image_distance_notices(fit_of(table2, stretch), table2)
         assert notice.code == "image-distance"
-
-
-def test_image_distance_is_that_of_the_exit_pupil(table2: Camera) -> None:
     for entrance_over_exit in (1.25, 0.5, 0.0):
         camera = thin_lens(table2, entrance_over_exit)
         assert image_distance_notices(fit_of(camera, 1.0), camera) == []
@@ -211,66 +207,46 @@ def test_image_distance_is_that_of_the_exit_pupil(table2: Camera) -> None:
         assert f"(pupil_ratio {0.8 / excess / 100.0 - 1.0:.3g} if all else is right)" in notice.remedy
 
 
-def test_f_numbers_that_do_not_match(table2: Camera) -> None:
-    assert table2.lens_image_width == pytest.approx(1.0)
-    for factor, told in ((0.85, 0), (1.2, 0), (1.67, 1), (0.6, 1)):
-        camera = replace(table2, aperture_mm=factor * table2.aperture_mm)
-        check_f_numbers(camera)
-        assert len(f_number_notices(camera)) == told
-    for factor in (3.1, 0.3):
-        with pytest.raises(ConfigError, match="aperture_mm: the main lens is f/"):
-            check_f_numbers(replace(table2, aperture_mm=factor * table2.aperture_mm))
-
-
 def rig_of(folder: Path, *changes: tuple[str, str]) -> Config:
     """Return the sample's rig, z from the focal point, with pieces of its text replaced."""
-    text = (ROOT / "configs" / "sample.yaml").read_text().replace("reference: mid_plane", "reference: focal_point")
-    for old, new in changes:
-        assert old in text
-        text = text.replace(old, new)
-    (folder / "rig.yaml").write_text(text)
-    return load_config(folder / "rig.yaml")
+    return load_config(sample_rig(folder, AT_FOCUS, *changes))
 
 
-def test_the_sample_rig_is_fine(tmp_path: Path) -> None:
-    assert plan_of(rig_of(tmp_path), None).notices == []
-
-
-def test_a_rim_may_lie_out_of_view(tmp_path: Path) -> None:
-    # the sensor sees 3.3 mm
-    assert plan_of(rig_of(tmp_path, ("shape_xyz: [30, 22, 40]", "shape_xyz: [35, 22, 40]")), None).notices == []
-
-
-def test_pixels_of_another_unit_are_refused(tmp_path: Path) -> None:
+def test_faults_of_a_rig_that_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"camera.sensor.pixel_um: is 0.0055: lens images would be .* px apart"):
         rig_of(tmp_path, ("pixel_um: 5.5", "pixel_um: 0.0055"))
     with pytest.raises(ConfigError, match="camera.sensor.pixel_um"):
         rig_of(tmp_path, ("pixel_um: 5.5", "pixel_um: 55"))
-
-
-def test_weights_want_the_pitch_of_the_calibration(tmp_path: Path) -> None:
+    (tmp_path / "rig.yaml").write_text(RIG)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", lf.LfpivWarning)
-        calibration = lf.calibrate(white(), None, lf.load_rig(rig_in(tmp_path)))
+        calibration = lf.calibrate(white(), None, lf.load_rig(tmp_path / "rig.yaml"))
     with pytest.raises(InputError, match=r"14.2 px apart and 18.25 px by the data sheet"):
         plan_of(rig_of(tmp_path), calibration)
 
 
-PAPERS_WINDOW = "{distance_mm: 98.0, thickness_mm: 2.0}"
-
-
 @pytest.mark.parametrize(
-    ("changes", "code"),
+    ("old", "new", "told"),
     [
-        ([("aperture_mm: 25.0", "aperture_mm: 41.0")], "f-numbers"),
-        ([("shape_xyz: [30, 22, 40]", "shape_xyz: [60, 22, 40]")], "volume-out-of-view"),
+        ("", "", []),
+        ("layout: square", "layout: hexagonal", []),
+        # the sensor sees 3.3 mm
+        ("shape_xyz: [30, 22, 40]", "shape_xyz: [35, 22, 40]", []),
+        ("shape_xyz: [30, 22, 40]", "shape_xyz: [60, 22, 40]", ["volume-out-of-view"]),
+        ("aperture_mm: 25.0", "aperture_mm: 41.0", ["f-numbers"]),
         # through 134 mm of water
-        ([("channel: {width_mm: 4.0, wall_mm: 2.0}", f"window: {PAPERS_WINDOW}")], "paraxial-refraction"),
+        (
+            "channel: {width_mm: 4.0, wall_mm: 2.0}",
+            "window: {distance_mm: 98.0, thickness_mm: 2.0}",
+            ["paraxial-refraction"],
+        ),
+        ("[30, 22, 40], voxel_mm: 0.1", "[1500, 1100, 400], voxel_mm: 0.002", ["heavy-work"]),
     ],
 )
-def test_faults_of_a_rig_are_told(changes: list[tuple[str, str]], code: str, tmp_path: Path) -> None:
-    (notice,) = plan_of(rig_of(tmp_path, *changes), None).notices
-    assert notice.code == code
+def test_faults_of_a_rig_are_told(old: str, new: str, told: list[str], tmp_path: Path) -> None:
+    plan = plan_of(rig_of(tmp_path, (old, new)), None)
+    cost = cost_of(plan.settings, plan.camera, plan.source, plan.grid.padded(plan.padding))
+    assert [each.code for each in (*plan.notices, *cost_notices(cost))] == told
 
 
 OBJECTIVE = """
@@ -288,57 +264,35 @@ def test_microscope_objectives(na: float, told: list[str] | None, tmp_path: Path
     aperture = 2.0 * 10.5 * np.tan(np.arcsin(na))
     rig = OBJECTIVE.replace("APERTURE", f"{aperture:.4f}").replace("F_NUMBER", f"{210.0 / aperture:.4f}")
     (tmp_path / "rig.yaml").write_text(rig)
-    if told is None:
-        with pytest.raises(ConfigError, match=r"NA 0\.80.* at most 1 may be"):
-            plan_of(load_config(tmp_path / "rig.yaml"), None)
-    else:
+    with pytest.raises(ConfigError, match=r"NA 0\.80.* at most 1 may be") if told is None else nullcontext():
         assert [each.code for each in plan_of(load_config(tmp_path / "rig.yaml"), None).notices] == told
 
 
-def test_refraction_error_is_the_papers_aberration(table2: Camera, water: Media, window: Window) -> None:
+def test_refraction_error_is_the_papers_aberration_and_sine_error_that_of_two_rays(
+    table2: Camera, water: Media, window: Window
+) -> None:
     # 0.085 mm of apparent depth at the edge of an f/4 lens through 134 mm of water, under the rim's slope
     error = refraction_error_mm(table2, water, window, np.zeros(1))
     assert error == pytest.approx(0.085 * 12.5 / 200.0, rel=0.05)
     assert refraction_error_mm(table2, Media(), None, np.array([-1.0, 0.0, 5.0])) < 1e-12
     # not known what is before the fluid: less than with it
     assert 0.0 < refraction_error_mm(table2, water, None, np.array([-5.0, 0.0])) < error
-
-
-def test_sine_error_is_that_of_two_rays(table2: Camera) -> None:
     tangent = 12.5 / 200.0
     sine = np.sin(np.arctan(tangent))
     assert sine_error_mm(table2, Media(), np.array([-3.0, 2.0])) == pytest.approx(3.0 * (tangent - sine))
 
 
-def test_work_is_estimated_before_it_begins(tmp_path: Path, capsys) -> None:
-    rig_of(tmp_path)
-    command = ["build-weights", str(tmp_path / "rig.yaml"), "-o", str(tmp_path / "w.h5"), "--json"]
-    cli.main([*command, "--dry-run"], standalone_mode=False)
-    estimated = json.loads(capsys.readouterr().out)
+def test_work_is_estimated_before_it_begins(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    command = ("build-weights", sample_rig(tmp_path, AT_FOCUS), "-o", tmp_path / "w.h5")
+    estimated = told(capsys, *command, "--dry-run")
     assert not (tmp_path / "w.h5").exists()
     assert estimated["warnings"] == []
-    cli.main(command, standalone_mode=False)
-    made = json.loads(capsys.readouterr().out)
+    made = told(capsys, *command)
     weights = open_weights(tmp_path / "w.h5").weights.solver_operator
-    assert isinstance(weights, FactorisedOperator)
     held = sum(each.cell.nbytes + each.share.nbytes for each in (weights.columns, weights.rows))
     assert estimated["estimated_weights_bytes"] == pytest.approx(held + 4 * 600 * 448, rel=0.5)
     for name in ("voxels_xyz", "padding_xyz", "method"):
         assert estimated[name] == made[name]
-
-
-@pytest.mark.parametrize(
-    ("changes", "told"),
-    [
-        ([], []),
-        ([("layout: square", "layout: hexagonal")], []),
-        ([("shape_xyz: [30, 22, 40], voxel_mm: 0.1", "shape_xyz: [1500, 1100, 400], voxel_mm: 0.002")], ["heavy-work"]),
-    ],
-)
-def test_heavy_work_is_told(changes: list[tuple[str, str]], told: list[str], tmp_path: Path) -> None:
-    plan = plan_of(rig_of(tmp_path, *changes), None)
-    cost = cost_of(plan.settings, plan.camera, plan.source, plan.grid.padded(plan.padding))
-    assert [each.code for each in cost_notices(cost)] == told
 
 
 def test_columns_on_demand_cost_more_than_factors(tmp_path: Path) -> None:
@@ -350,51 +304,39 @@ def test_columns_on_demand_cost_more_than_factors(tmp_path: Path) -> None:
     assert costs[1].weights_core_s == costs[1].weights_bytes == 0.0
 
 
-def tracks(velocity: float) -> Points:
-    arrays = {"velocity": np.full((5, 3), velocity), "velocity_sigma": np.full((5, 3), 1e-3)}
-    arrays["velocity_sigma"][0] = np.nan
-    return Points(np.zeros((5, 3)), arrays, Reference("focal_point", 0.0), attributes={}, provenance={})
-
-
-def test_one_image_twice_is_told_of_its_tracks() -> None:
-    assert [notice.code for notice in still_notices(tracks(1e-6), "a")] == ["frames-alike"]
-    assert still_notices(tracks(1e-3), "a") == []
-
-
 @pytest.mark.parametrize(
-    ("counts", "linked", "told"), [((60, 50), 40, []), ((60, 50), 20, ["few-links"]), ((5, 5), 2, ["few-particles"])]
-)
-def test_few_links_are_told_where_particles_are_many(counts: tuple[int, int], linked: int, told: list[str]) -> None:
-    found = Tracked(
-        tracks(1e-3),
-        "",
-        [],
-        {"tracks": linked, "expected_wrong_links": 0.0},
-        load_config(ROOT / "configs" / "sample.yaml"),
-    )
-    assert [notice.code for notice in few_notices(counts, ("a", "b"), found.summary, found.points)] == told
-
-
-@pytest.mark.parametrize(
-    ("summary", "told"),
+    ("tracks", "wrong", "more", "told"),
     [
-        ({"tracks": 100, "expected_wrong_links": 4.9}, []),
-        ({"tracks": 100, "expected_wrong_links": 5.1}, ["wrong-links"]),
-        ({"tracks": 0, "expected_wrong_links": 0.0}, []),
-        ({"tracks": 100, "expected_wrong_links": 0.0, "light_b_over_a": 0.81}, []),
-        ({"tracks": 100, "expected_wrong_links": 0.0, "light_b_over_a": 0.79}, ["light-unequal"]),
-        ({"tracks": 100, "expected_wrong_links": 0.0, "light_b_over_a": 1.26}, ["light-unequal"]),
+        (100, 4.9, {}, []),
+        (100, 5.1, {}, ["wrong-links"]),
+        (0, 0.0, {}, []),
         # a track of five places has four links
-        ({"tracks": 20, "tracked": 100, "expected_wrong_links": 3.9, "noise_over_stated": [1.3, 2.9, 1.0]}, []),
-        ({"tracks": 20, "tracked": 100, "expected_wrong_links": 4.1, "noise_over_stated": None}, ["wrong-links"]),
-        (
-            {"tracks": 20, "tracked": 100, "expected_wrong_links": 0.0, "noise_over_stated": [6.4, 1, 1]},
-            ["tracks-bend"],
-        ),
+        (20, 3.9, {"tracked": 100, "noise_over_stated": [1.3, 2.9, 1.0]}, []),
+        (20, 4.1, {"tracked": 100, "noise_over_stated": None}, ["wrong-links"]),
+        (20, 0.0, {"tracked": 100, "noise_over_stated": [6.4, 1, 1]}, ["tracks-bend"]),
+        (100, 0.0, {"light_b_over_a": 0.81}, []),
+        (100, 0.0, {"light_b_over_a": 0.79}, ["light-unequal"]),
+        (100, 0.0, {"light_b_over_a": 1.26}, ["light-unequal"]),
     ],
 )
-def test_doubtful_links_and_bent_tracks_are_told(summary: dict[str, Any], told: list[str]) -> None:
+def test_doubtful_links_and_bent_tracks_are_told(
+    tracks: int, wrong: float, more: dict[str, Any], told: list[str]
+) -> None:
+    summary = {"tracks": tracks, "expected_wrong_links": wrong} | more
     assert [notice.code for notice in doubt_notices(summary, "a")] == told
+
+
+def test_one_image_twice_and_few_links_are_told() -> None:
+    def tracks(velocity: float) -> Points:
+        arrays = {"velocity": np.full((5, 3), velocity), "velocity_sigma": np.full((5, 3), 1e-3)}
+        arrays["velocity_sigma"][0] = np.nan
+        return Points(np.zeros((5, 3)), arrays, FOCAL_POINT, attributes={}, provenance={})
+
+    assert [notice.code for notice in still_notices(tracks(1e-6), "a")] == ["frames-alike"]
+    assert still_notices(tracks(1e-3), "a") == []
+    for counts, linked, codes in (((60, 50), 40, []), ((60, 50), 20, ["few-links"]), ((5, 5), 2, ["few-particles"])):
+        summary = {"tracks": linked, "expected_wrong_links": 0.0}
+        assert [notice.code for notice in few_notices(counts, ("a", "b"), summary, tracks(1e-3))] == codes
 
 
 def told_of_board(camera: Camera, board: BoardGeometry, found: int, z_mm: float, magnification: float) -> list[Notice]:
@@ -405,13 +347,10 @@ def told_of_board(camera: Camera, board: BoardGeometry, found: int, z_mm: float,
     return list(board_notices(pose, board, camera, Media(1.0, 1.49, 1.33)))
 
 
-def test_few_points_of_a_board_are_told(table2: Camera) -> None:
+def test_boards_with_doubts_are_told(table2: Camera) -> None:
     assert told_of_board(table2, BoardGeometry((3, 3), 0.6, 0.2), 9, 5.0, -1.0) == []
     (told,) = told_of_board(table2, BoardGeometry((3, 2), 0.6, 0.2), 6, 5.0, -1.0)
     assert (told.code, told.measured) == ("board-few-points", 6.0)
-
-
-def test_dots_within_single_lenses_are_told(table2: Camera) -> None:
     scale = table2.scale(Media())
     board, larger = (BoardGeometry((5, 4), 0.6, size * scale.lens_mm) for size in (0.7, 1.1))
     (told,) = told_of_board(table2, board, 20, -0.1 * scale.depth_mm, -1.0)
@@ -421,9 +360,6 @@ def test_dots_within_single_lenses_are_told(table2: Camera) -> None:
     assert "by 1 mm" in told.remedy
     assert told_of_board(table2, board, 20, -0.4 * scale.depth_mm, -1.0) == []
     assert told_of_board(table2, larger, 20, 0.0, -1.0) == []
-
-
-def test_a_board_in_part_or_of_another_size_is_told(table2: Camera) -> None:
     board = BoardGeometry((5, 4), 0.6, 0.2)
     # Dots 0.5 mm apart that are said to be 0.6 show a magnification of 0.836.
     cases = (
@@ -437,66 +373,52 @@ def test_a_board_in_part_or_of_another_size_is_told(table2: Camera) -> None:
         assert [each.code for each in told_of_board(table2, board, found, 5.0, magnification)] == codes
 
 
-@pytest.mark.parametrize(
-    ("residual", "codes"), [(0.09, []), (0.11, ["light-model"]), (0.19, ["light-model"]), (0.21, ["light-unexplained"])]
-)
-def test_light_that_particles_do_not_explain_is_reported(residual: float, codes: list[str]) -> None:
-    measured = {"residual": residual, "residual_rms_counts": 100.0, "read_noise_counts": 1.0, "particles_per_lens": 0.1}
-    for light, remedy in (("rays", "give reconstruction.wavelength_nm"), ("waves", "wavelength_nm and diffusion_px")):
-        attributes = measured | {"light": light}
-        points = Points(np.zeros((4, 3)), {}, Reference("focal_point", 0.0), attributes=attributes, provenance={})
-        notices = light_notices(points, "a.vtkhdf")
-        assert [notice.code for notice in notices] == codes
-        assert all(remedy in notice.remedy for notice in notices if notice.code == "light-model")
+def told_of(**measured: object) -> list[Notice]:
+    """Return what is told of particles that leave little light unexplained, but for what is measured."""
+    little = {"residual": 0.05, "residual_rms_counts": 100.0, "read_noise_counts": 1.0, "particles_per_lens": 0.1}
+    points = Points(np.zeros((4, 3)), {}, FOCAL_POINT, attributes=little | {"light": "rays"} | measured, provenance={})
+    return list(light_notices(points, "a.vtkhdf"))
 
 
 @pytest.mark.parametrize(
-    ("crowd", "words"),
+    ("measured", "code", "words"),
     [
-        ({"particles_per_lens": 0.0}, []),
-        ({"particles_per_lens": 1.39}, []),
-        ({"particles_per_lens": 1.41}, ["1.41 particles for each microlens, at most 1.4"]),
+        ({"residual": 0.09}, None, ""),
+        ({"residual": 0.11}, "light-model", "give reconstruction.wavelength_nm"),
+        ({"residual": 0.19, "light": "waves"}, "light-model", "wavelength_nm and diffusion_px"),
+        ({"residual": 0.21}, "light-unexplained", ""),
+        ({"particles_per_lens": 0.0}, None, ""),
+        ({"particles_per_lens": 1.39}, None, ""),
+        ({"particles_per_lens": 1.41}, "particles-crowded", "1.41 particles for each microlens, at most 1.4"),
         # Few were found of those that were counted.
-        ({"particles_per_lens": 1.2, "tracers_per_lens": 1.29}, []),
-        ({"particles_per_lens": 1.2, "tracers_per_lens": 4.0}, ["4 particles for each microlens, 1.2 found of 4"]),
+        ({"particles_per_lens": 1.2, "tracers_per_lens": 1.29}, None, ""),
+        ({"particles_per_lens": 1.2, "tracers_per_lens": 4.0}, "particles-crowded", "4 particles for each microlens, "),
+        ({"particles_per_lens": 1.2, "tracers_per_lens": 4.0}, "particles-crowded", ", 1.2 found of 4"),
+        ({"microlens_focus": 0.004, "microlens_focus_sigma": 0.0001}, None, ""),
+        ({"microlens_focus": 0.02, "microlens_focus_sigma": 0.005}, None, ""),
+        ({"microlens_focus": 0.02, "microlens_focus_sigma": 0.001}, "microlens-focus", "2.0% longer than the rig says"),
+        ({"microlens_focus": -0.02, "microlens_focus_sigma": 0.001}, "microlens-focus", "2.0% shorter than the rig"),
+        ({"microlens_focus": -0.006, "microlens_focus_sigma": 0.001}, "microlens-focus", "at most 0.5%"),
     ],
 )
-def test_crowded_particles_are_told(crowd: dict[str, float], words: list[str]) -> None:
-    measured = {"residual": 0.1, "residual_rms_counts": 1.0, "read_noise_counts": 1.0} | crowd
-    reference = Reference("focal_point", 0.0)
-    found = light_notices(Points(np.zeros((4, 3)), {}, reference, attributes=measured, provenance={}), "a.vtkhdf")
-    assert [notice.code for notice in found] == ["particles-crowded"] * len(words)
-    assert all(notice.text.startswith(text) for notice, text in zip(found, words, strict=True))
+def test_what_light_tells_of_particles(measured: dict[str, Any], code: str | None, words: str) -> None:
+    found = told_of(**measured)
+    assert [notice.code for notice in found] == ([] if code is None else [code])
+    assert all(words in f"{notice.text}; {notice.remedy}" for notice in found)
 
 
-@pytest.mark.parametrize(
-    ("off", "sigma", "words"),
-    [
-        (0.004, 0.0001, []),
-        (0.02, 0.005, []),
-        (0.02, 0.001, ["2.0% longer than the rig says"]),
-        (-0.02, 0.001, ["2.0% shorter than the rig says"]),
-        (-0.006, 0.001, ["at most 0.5%"]),
-    ],
-)
-def test_microlenses_of_another_focal_length_are_told(off: float, sigma: float, words: list[str]) -> None:
-    measured = {"residual": 0.05, "residual_rms_counts": 1.0, "read_noise_counts": 1.0, "particles_per_lens": 0.1}
-    measured |= {"microlens_focus": off, "microlens_focus_sigma": sigma}
-    points = Points(np.zeros((4, 3)), {}, Reference("focal_point", 0.0), attributes=measured, provenance={})
-    found = light_notices(points, "a.vtkhdf")
-    assert [notice.code for notice in found] == ["microlens-focus"] * len(words)
-    assert all(text in notice.text for notice, text in zip(found, words, strict=True))
-    # Crowded tracers seem to show another one where it is as it should be.
-    for crowd, limit in ((0.5, 0.005), (4.0, 0.02)):
-        crowded = replace(points, attributes=measured | {"particles_per_lens": 1.0, "tracers_per_lens": crowd})
-        codes = {notice.code for notice in light_notices(crowded, "a.vtkhdf")}
-        assert ("microlens-focus" in codes) == (abs(off) > max(limit, 5.0 * sigma))
+def test_crowded_tracers_seem_to_show_another_focal_length() -> None:
+    for off, sigma in ((0.004, 0.0001), (0.02, 0.005), (0.02, 0.001), (-0.03, 0.001), (-0.006, 0.001)):
+        for crowd, limit in ((0.5, 0.005), (4.0, 0.02)):
+            focus = {"microlens_focus": off, "microlens_focus_sigma": sigma}
+            found = {notice.code for notice in told_of(particles_per_lens=1.0, tracers_per_lens=crowd, **focus)}
+            assert ("microlens-focus" in found) == (abs(off) > max(limit, 5.0 * sigma))
 
 
 @pytest.mark.thorough
 def test_without_a_board_the_data_sheet_is_believed() -> None:
-    rig = lf.load_rig(ROOT / "configs" / "sample.yaml")
-    white, dark, board = (lf.read_image(ROOT / "sample_data" / f"{name}.tif") for name in ("white", "dark", "board"))
+    rig = lf.load_rig(CONFIG)
+    white, dark, board = (lf.read_image(SAMPLE / f"{name}.tif") for name in ("white", "dark", "board"))
     with pytest.warns(lf.LfpivWarning, match="no-board"):
         lf.calibrate(white, None, rig, dark=dark)
     with warnings.catch_warnings():

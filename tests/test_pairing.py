@@ -1,7 +1,5 @@
 """Pairs by name: the names that cameras give, and that no name lost, moved or repeated ever makes a wrong pair."""
 
-from __future__ import annotations
-
 import random
 from collections.abc import Callable, Sequence
 from itertools import pairwise
@@ -121,9 +119,8 @@ def test_whatever_of_a_sequence_is_lost_no_pair_is_wrong(form: str) -> None:
             assert [notice.code for notice in found.notices] == ["numbers-apart"]
 
 
-def test_two_lost_frames_do_not_turn_the_others_round() -> None:
-    names = [f"{letter}{k}" for k in range(1, 11) for letter in "ab"]
-    left = [name for name in names if name not in ("b2", "a7")]
+def test_lost_frames_leave_the_pairs_around_them() -> None:
+    left = [name for k in range(1, 11) for name in (f"a{k}", f"b{k}") if name not in ("b2", "a7")]
     found = pair_names(left, "ab")
     assert named(left, found) == {(f"a{k}", f"b{k}") for k in (1, 3, 4, 5, 6, 8, 9, 10)}
     assert [(each.about, each.text) for each in found.left_out] == [
@@ -133,16 +130,17 @@ def test_two_lost_frames_do_not_turn_the_others_round() -> None:
     with pytest.raises(InputError, match=r"a2: the second frame .* 1 more.*--pair-by"):
         found.settled(keep_going=False)
     assert [notice.about for notice in found.settled(keep_going=True)] == ["a2", "b7"]
-
-
-def test_a_lost_running_number_leaves_the_pairs_around_it() -> None:
-    left = [f"run_{n:03d}" for n in (0, 1, 2, 4, 5)]
-    found = pair_names(left, "ab")
-    assert named(left, found) == {("run_000", "run_001"), ("run_004", "run_005")}
+    found = pair_names([f"run_{n:03d}" for n in (0, 1, 2, 4, 5)], "ab")
+    assert found.pairs == ((0, 1), (3, 4))
     assert [each.about for each in found.left_out] == ["run_002"]
+    # A repeated frame is left out with its pair.
+    found = pair_names(["x/1a", "x/1b", "y/1a", "x/2a", "x/2b"], "ab")
+    assert found.pairs == ((3, 4),)
+    assert [each.about for each in found.left_out] == ["x/1a", "y/1a", "x/1b"]
+    assert "twice: x/1a and y/1a" in found.left_out[0].text
 
 
-def test_where_pairs_begin_is_open_with_a_gap_and_without_a_zero() -> None:
+def test_where_pairs_begin_is_open_with_a_gap_and_names_that_tell_nothing_go_by_order() -> None:
     names = ["run_1", "run_2", "run_3", "run_5", "run_6"]
     found = pair_names(names, "ab")
     assert not found.pairs
@@ -150,6 +148,14 @@ def test_where_pairs_begin_is_open_with_a_gap_and_without_a_zero() -> None:
         found.settled(keep_going=True)
     assert named(names, pair_names(names, "ab", "run_{number:1}")) == {("run_1", "run_2"), ("run_5", "run_6")}
     assert named(names, pair_names(names, "ab", "run_{number}")) == {("run_2", "run_3")}
+    assert pair_names(["still", "moved"], "ab") == Pairs(((0, 1),))
+    found = pair_names(["still", "moved", "early", "late"], "ab")
+    assert found.pairs == ((0, 1), (2, 3))
+    assert [notice.code for notice in found.notices] == ["paired-by-order"]
+    with pytest.raises(InputError, match="early"):
+        pair_names(["still", "moved", "early"], "ab").settled(keep_going=False)
+    mixed = pair_names(["1a", "1b", "background"], "ab")
+    assert [each.about for each in mixed.left_out] == ["background"]
 
 
 @pytest.mark.parametrize("numbers", [range(2, 6), range(7, 9), range(1000, 1010)])
@@ -191,31 +197,18 @@ def test_what_names_contradict_of_two_frames(first: str, second: str, why: str |
     found = contradiction(*seen(first, second))
     assert (found is None) == (why is None)
     assert why is None or why in (found or "")
-
-
-def test_pages_apart_contradict_that_they_are_a_pair() -> None:
     pages = [Seen(f"run {page}", "run", "run", page) for page in (0, 1, 3)]
     assert contradiction(*pages[:2]) is None
     assert "numbers are 1 and 3" in (contradiction(*pages[1:]) or "")
 
 
-def test_a_repeated_frame_is_left_out_with_its_pair() -> None:
-    found = pair_names(["x/1a", "x/1b", "y/1a", "x/2a", "x/2b"], "ab")
-    assert found.pairs == ((3, 4),)
-    assert [each.about for each in found.left_out] == ["x/1a", "y/1a", "x/1b"]
-    assert "twice: x/1a and y/1a" in found.left_out[0].text
-
-
-def test_series_of_one_command_stay_apart() -> None:
+def test_series_of_one_command_stay_apart_and_a_letter_that_all_have_is_one_frame() -> None:
     names = ["hot_1", "hot_2", "cold_1", "cold_2"]
     # As ab, hot and cold could be the two frames.
     found = pair_names(names, "ab")
     assert not found.pairs
     assert "2 series" in found.left_out[0].text
     assert named(names, pair_names(names, "sequence")) == {("hot_1", "hot_2"), ("cold_1", "cold_2")}
-
-
-def test_a_letter_that_all_have_is_one_frame_of_pairs_but_no_matter_in_a_sequence() -> None:
     names = ["img_1_a", "img_2_a", "img_3_a"]
     assert not pair_names(names, "ab").pairs
     in_time = pair_names(names, "sequence")
@@ -226,32 +219,18 @@ def test_a_letter_that_all_have_is_one_frame_of_pairs_but_no_matter_in_a_sequenc
     assert len(pair_names(["B0001_0", "B0001_1"], "ab").pairs) == 1
 
 
-def test_a_sequence_has_no_pair_across_a_gap() -> None:
+def test_a_sequence_has_no_pair_across_a_gap_and_numbers_apart_are_steps() -> None:
     names = ["t_9", "t_10", "t_12", "t_13"]
     found = pair_names(names, "sequence")
     assert found.pairs == ((0, 1), (2, 3))
     assert [(each.about, each.text) for each in found.left_out] == [("t_12", "frames are missing between t_10 and it")]
     letters = ["1a", "1b", "2b", "3a"]
     assert named(letters, pair_names(letters, "sequence")) == {("1a", "1b"), ("2b", "3a")}
-
-
-def test_numbers_apart_are_taken_as_steps_and_said() -> None:
     found = pair_names(["t_0", "t_2", "t_4", "t_8"], "sequence")
     assert found.pairs == ((0, 1), (1, 2))
     assert found.notices[0].code == "numbers-apart"
     stamps = [f"20240131_1200{second:02d}" for second in (0, 1, 2, 5)]
     assert pair_names(stamps, "sequence").pairs == ((0, 1), (1, 2))
-
-
-def test_order_alone_pairs_names_that_tell_nothing() -> None:
-    assert pair_names(["still", "moved"], "ab") == Pairs(((0, 1),))
-    found = pair_names(["still", "moved", "early", "late"], "ab")
-    assert found.pairs == ((0, 1), (2, 3))
-    assert [notice.code for notice in found.notices] == ["paired-by-order"]
-    with pytest.raises(InputError, match="early"):
-        pair_names(["still", "moved", "early"], "ab").settled(keep_going=False)
-    mixed = pair_names(["1a", "1b", "background"], "ab")
-    assert [each.about for each in mixed.left_out] == ["background"]
 
 
 @pytest.mark.parametrize(
@@ -267,41 +246,31 @@ def test_order_alone_pairs_names_that_tell_nothing() -> None:
 )
 def test_templates(template: str, names: list[str]) -> None:
     assert pair_names(names[::-1], "ab", template).pairs == ((1, 0),)
+    for too_little in ("img", "{pair}", "{frame}_{frame}", "{pear}_{frame}", "{pair}_{frame", "{}"):
+        with pytest.raises(UsageError, match="--pair-by"):
+            places_by(too_little, ["img_1_a"])
 
 
-@pytest.mark.parametrize("template", ["img", "{pair}", "{frame}_{frame}", "{pear}_{frame}", "{pair}_{frame", "{}"])
-def test_templates_that_say_too_little_are_refused(template: str) -> None:
-    with pytest.raises(UsageError, match="--pair-by"):
-        places_by(template, ["img_1_a"])
-
-
-def test_a_pair_has_two_frames() -> None:
+def test_a_pair_has_two_frames_and_one_frame_is_none() -> None:
     with pytest.raises(UsageError, match="x, y, z"):
         places_by("{pair}_{frame}", ["1_x", "1_y", "1_z"])
     found = pair_names(["1_a", "1_b", "2_a", "other"], "ab", "{pair}_{frame}")
     assert [each.about for each in found.left_out] == ["other", "2_a"]
-
-
-def test_one_frame_is_no_pair() -> None:
     for how in ("ab", "sequence"):
         with pytest.raises(UsageError, match=f"--pairing {how}: needs two or more"):
             pair_names(["1a"], how)
 
 
-def test_those_beside() -> None:
+def test_those_beside_and_the_order_of_work_and_numbers() -> None:
     found = pair_names(["2", "1", "0"], "sequence")
     assert found.beside(3) == [(1,), (0, 2), (1,)]
     assert found.first_of() == {}
     found = pair_names(["1a", "2a", "2b", "1b"], "ab")
     assert found.beside(4) == [(3,), (2,), (1,), (0,)]
     assert found.first_of() == {3: 0, 2: 1}
-
-
-def seen(*names: str) -> list[Seen]:
-    return [Seen(name, name, name) for name in names]
-
-
-def test_a_sequence_is_in_the_order_of_its_numbers() -> None:
+    pairs = Pairs(((0, 3), (2, 4)))
+    assert pairs.order(6) == [0, 3, 2, 4, 1, 5]
+    assert Pairs(((0, 1), (1, 2)), separate=False).order(3) == [0, 1, 2]
     assert in_order(seen("t_1", "t_2", "t_3")) == ([0, 1, 2], [])
     order, notices = in_order(seen("t_1", "t_10", "t_9", "t_8"))
     assert order == [0, 3, 2, 1]
@@ -313,7 +282,5 @@ def test_a_sequence_is_in_the_order_of_its_numbers() -> None:
         assert in_order(seen(*names)) == (list(range(len(names))), [])
 
 
-def test_the_work_goes_by_pairs_and_frames_without_a_partner_are_last() -> None:
-    pairs = Pairs(((0, 3), (2, 4)))
-    assert pairs.order(6) == [0, 3, 2, 4, 1, 5]
-    assert Pairs(((0, 1), (1, 2)), separate=False).order(3) == [0, 1, 2]
+def seen(*names: str) -> list[Seen]:
+    return [Seen(name, name, name) for name in names]

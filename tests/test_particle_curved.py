@@ -1,7 +1,5 @@
 """Particles behind curved faces: their response against rays counted through a pipe, its derivatives, and fits."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -19,6 +17,7 @@ from lfpiv_cli.particles.least_squares import lit_by, observation_of, respond_al
 from lfpiv_cli.particles.pencil import MEAN_SQUARE, NODES, WEIGHTS, cubic_at, pencil_of
 from lfpiv_cli.particles.refraction import on_line_of_sight, places_by_snell
 from lfpiv_cli.particles.view import View, entry_capacity, footprint_radius_mm, on_array_mm, raw_view, tile_side_mm
+from tests.known_rays import image_of
 from tests.particle_twin import respond_once
 
 RADIUS_MM = 0.025
@@ -64,9 +63,7 @@ def counted(camera: Camera, space: CurvedSpace, point: tuple[float, float, float
     crossing = disc_points(rays, camera.aperture_radius_mm, rng)
     slopes, there = space.slopes(camera, np.array(point) + away, crossing)
     assert there.all()
-    column, row = np.rint(camera.mm_to_px(trace(camera, crossing, slopes).sensor_mm)).astype(np.int64).T
-    inside = (column >= 0) & (column < camera.columns) & (row >= 0) & (row < camera.rows)
-    return np.bincount((row * camera.columns + column)[inside], minlength=camera.rows * camera.columns) / rays
+    return image_of(camera, trace(camera, crossing, slopes).sensor_mm, 1.0 / rays).ravel()
 
 
 @pytest.mark.thorough
@@ -170,7 +167,7 @@ def test_the_line_is_closest_to_the_slopes(camera: Camera, water: Media) -> None
             np.testing.assert_allclose(pencil.line_moves[:, :, axis], (ahead - behind) / 2e-4, atol=1e-3)
 
 
-def test_what_the_wall_hides_has_no_light(view: View) -> None:
+def test_what_the_wall_hides_has_no_light_and_footprints_hold_the_rest(view: View, camera: Camera) -> None:
     for place in ((0.1, 4.9, 3.0), (0.0, 5.5, 0.0), (0.0, 0.0, -6.0)):
         assert not images(view, np.array(place)).any()
     points = np.array([(0.1, 4.9, 3.0), (0.1, 3.0, 1.0)])
@@ -179,9 +176,6 @@ def test_what_the_wall_hides_has_no_light(view: View) -> None:
     np.testing.assert_array_equal(places_by_snell(points, view), points)
     # From the middle of the pipe no line of sight reaches a depth outside it.
     assert on_line_of_sight(view, 0.1, 0.2, 0.0, 6.0) == (0.1, 0.2)
-
-
-def test_footprints_hold_the_light(camera: Camera, view: View) -> None:
     columns = np.arange(view.camera.rows * view.camera.columns)
     for place in PLACES:
         lit = np.flatnonzero(images(view, np.array(place))[:, 0])

@@ -1,6 +1,4 @@
-"""Particles and tracks on disk: what is written is read, VTK opens it, and what is broken is refused."""
-
-from __future__ import annotations
+"""Particles and tracks on disk: what is written is read, VTK opens and plays it, what is broken is refused."""
 
 from pathlib import Path
 
@@ -8,9 +6,22 @@ import h5py
 import numpy as np
 import pytest
 
-from lfpiv_cli.errors import InputError
-from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, TRACKS_FORMAT, Points, read_points, symmetric, write_points
+from lfpiv_cli.errors import InputError, OutputError, OutputExistsError
+from lfpiv_cli.files import hdf5, particle_file
+from lfpiv_cli.files.exports.vtk import write_playback
+from lfpiv_cli.files.particle_file import (
+    PARTICLES_FORMAT,
+    POSITION,
+    TRACKS_FORMAT,
+    TRAJECTORIES_FORMAT,
+    Points,
+    StoredTracks,
+    read_points,
+    symmetric,
+    write_points,
+)
 from lfpiv_cli.reference import Reference
+from lfpiv_cli.verbs.track import KEPT_FRAMES, SeenFrames
 
 REFERENCE = Reference("mid_plane", -0.4)
 
@@ -30,15 +41,14 @@ def path(tmp_path: Path, rng: np.random.Generator) -> Path:
     return target
 
 
-def test_what_is_written_is_read(path: Path) -> None:
+def test_what_is_written_is_read_and_vtk_opens_the_very_file(path: Path) -> None:
     points = read_points(path, PARTICLES_FORMAT)
     np.testing.assert_array_equal(points.position_mm, np.arange(15.0).reshape(5, 3))
     assert points.arrays["covariance_mm2"].shape == (5, 6)
     assert points.reference == REFERENCE
     assert points.provenance == {"a": 1}
-
-
-def test_vtk_opens_the_very_file(path: Path) -> None:
+    matrix = np.array([[[1.0, 4.0, 6.0], [4.0, 2.0, 5.0], [6.0, 5.0, 3.0]]])
+    assert symmetric(matrix).tolist() == [[1.0, 2.0, 3.0, 4.0, 5.0, 6.0]]
     vtk = pytest.importorskip("vtkmodules.vtkIOHDF")
     from vtkmodules.util.numpy_support import vtk_to_numpy
 
@@ -52,28 +62,151 @@ def test_vtk_opens_the_very_file(path: Path) -> None:
     np.testing.assert_array_equal(intensity, read_points(path, PARTICLES_FORMAT).arrays["intensity"])
 
 
-def test_an_empty_set_is_a_set(tmp_path: Path) -> None:
-    target = tmp_path / "tracks.vtkhdf"
-    vectors = {name: np.zeros((0, 3)) for name in ("velocity", "velocity_sigma", "displacement_mm")}
-    numbers = {name: np.zeros(0, np.int64) for name in ("particle_a", "particle_b")}
-    probability = {"link_probability": np.zeros(0)}
-    empty = Points(np.zeros((0, 3)), vectors | numbers | probability, REFERENCE, {}, {})
-    write_points(target, TRACKS_FORMAT, empty, overwrite=False)
-    assert read_points(target, TRACKS_FORMAT).position_mm.shape == (0, 3)
-
-
-def test_another_format_is_refused(path: Path) -> None:
+def test_another_format_and_values_that_are_no_numbers_are_refused(path: Path) -> None:
     with pytest.raises(InputError, match="lfpiv-tracks"):
         read_points(path, TRACKS_FORMAT)
-
-
-def test_values_that_are_no_numbers_are_refused(path: Path) -> None:
     with h5py.File(path, "a") as file:
         file["chi2"][2] = np.nan
     with pytest.raises(InputError, match="chi2"):
         read_points(path, PARTICLES_FORMAT)
 
 
-def test_tensors_are_in_vtks_order() -> None:
-    matrix = np.array([[[1.0, 4.0, 6.0], [4.0, 2.0, 5.0], [6.0, 5.0, 3.0]]])
-    assert symmetric(matrix).tolist() == [[1.0, 2.0, 3.0, 4.0, 5.0, 6.0]]
+@pytest.fixture
+def tracks() -> Points:
+    """Three tracks in four frames, by track: through all, from the second on, and in the last two; none in a fifth."""
+    track = np.array([0, 0, 0, 0, 1, 1, 1, 2, 2])
+    frame = np.array([0, 1, 2, 3, 1, 2, 3, 2, 3])
+    position = np.column_stack([track, frame, 0.5 * track + frame]).astype(np.float64)
+    velocity = np.column_stack([10.0 * track + frame, np.zeros(9), np.ones(9)])
+    arrays = {"track": track, "frame": frame, "velocity": velocity, "velocity_sigma": 0.1 * np.ones((9, 3))}
+    return Points(position, arrays, Reference("mid_plane", 0.5), {}, {"command": "follow"})
+
+
+def test_vtk_plays_the_places_of_each_frame(tracks: Points, tmp_path: Path) -> None:
+    vtk = pytest.importorskip("vtkmodules.vtkIOHDF")
+    from vtkmodules.util.numpy_support import vtk_to_numpy
+
+    write_playback(tmp_path / "playback.vtkhdf", tracks, 5, 0.002, overwrite=False)
+    with pytest.raises(OutputExistsError):
+        write_playback(tmp_path / "playback.vtkhdf", tracks, 4, 0.002, overwrite=False)
+    reader = vtk.vtkHDFReader()
+    reader.SetFileName(str(tmp_path / "playback.vtkhdf"))
+    reader.UpdateInformation()
+    assert reader.GetNumberOfSteps() == 5
+    for step in range(5):
+        reader.SetStep(step)
+        reader.Update()
+        assert reader.GetTimeValue() == pytest.approx(0.002 * step)
+        shown, here = reader.GetOutput(), tracks.arrays["frame"] == step
+        assert shown.GetNumberOfPoints() == shown.GetNumberOfVerts() == here.sum()
+        if here.any():
+            np.testing.assert_array_equal(vtk_to_numpy(shown.GetPoints().GetData()), tracks.position_mm[here])
+            for name in ("track", "velocity"):
+                np.testing.assert_array_equal(
+                    vtk_to_numpy(shown.GetPointData().GetArray(name)), tracks.arrays[name][here]
+                )
+
+
+FRAMES, TRACKS = 9, 40
+
+
+@pytest.fixture
+def many_tracks(rng: np.random.Generator) -> Points:
+    """Places of tracks by track, then by frame: some begin late, some miss frames, and the fifth frame has none."""
+    there = rng.random((TRACKS, FRAMES)) < 0.7
+    there[:, 4] = False
+    there[7] = False
+    track, frame = np.nonzero(there)
+    n = len(track)
+    probability = np.where(frame == 0, np.nan, rng.random(n))
+    arrays = {"velocity": rng.random((n, 3)), "velocity_sigma": rng.random((n, 3)), "track": track, "frame": frame}
+    arrays |= {"particle": rng.integers(0, 99, n), "link_probability": probability}
+    return Points(rng.random((n, 3)), arrays, REFERENCE, {"dt_s": 0.1}, {"command": "follow"})
+
+
+def put(folder: Path, many_tracks: Points) -> StoredTracks:
+    """Return many_tracks after they were put on a disk, frame by frame."""
+    store = StoredTracks(folder, many_tracks.reference, many_tracks.attributes, many_tracks.provenance)
+    for number in range(FRAMES):
+        here = many_tracks.arrays["frame"] == number
+        store.put({POSITION: many_tracks.position_mm[here]} | {k: v[here] for k, v in many_tracks.arrays.items()})
+    return store
+
+
+@pytest.mark.parametrize("block", [1, 20, 10_000])
+def test_files_are_those_of_tracks_in_memory(
+    many_tracks: Points, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, block: int
+) -> None:
+    monkeypatch.setattr(hdf5, "CHUNK_BYTES", 400)
+    monkeypatch.setattr(particle_file, "BLOCK_ROWS", block)
+    monkeypatch.setattr(particle_file, "CHECKED_ROWS", 30)
+    with put(tmp_path, many_tracks) as stored:
+        for name, each in (("memory", many_tracks), ("disk", stored)):
+            write_points(tmp_path / f"{name}.vtkhdf", TRAJECTORIES_FORMAT, each, overwrite=False)
+            write_playback(tmp_path / f"{name}_played.vtkhdf", each, FRAMES, 0.1, overwrite=False)
+    for name in ("{}.vtkhdf", "{}_played.vtkhdf"):
+        memory, disk = ((tmp_path / name.format(each)).read_bytes() for each in ("memory", "disk"))
+        assert memory == disk
+    with h5py.File(tmp_path / "disk.vtkhdf") as file:
+        for name, array in many_tracks.arrays.items():
+            np.testing.assert_array_equal(file[name], array)
+    assert len(list(tmp_path.iterdir())) == 4
+
+
+def test_a_block_of_tracks_is_read_at_a_time(
+    many_tracks: Points, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(particle_file, "BLOCK_ROWS", 20)
+    with put(tmp_path, many_tracks) as stored:
+        pieces = list(stored.rows("track"))
+    assert len(pieces) > 5
+    # The last track of a block is whole.
+    assert max(map(len, pieces)) < 20 + FRAMES
+
+
+def test_no_tracks_are_written_too(tmp_path: Path) -> None:
+    nothing = {name: np.zeros(0, np.int64) for name in ("track", "frame", "particle")}
+    nothing |= {name: np.zeros((0, 3)) for name in (POSITION, "velocity", "velocity_sigma")}
+    nothing |= {"link_probability": np.zeros(0)}
+    with StoredTracks(tmp_path, REFERENCE, {}, {}) as store:
+        store.put(nothing)
+        store.put(nothing)
+        write_points(tmp_path / "none.vtkhdf", TRAJECTORIES_FORMAT, store, overwrite=False)
+        write_playback(tmp_path / "played.vtkhdf", store, 2, 0.1, overwrite=False)
+    with h5py.File(tmp_path / "none.vtkhdf") as file:
+        assert file[POSITION].shape == (0, 3)
+    pair = {name: np.zeros((0, 3)) for name in ("velocity", "velocity_sigma", "displacement_mm")}
+    pair |= {name: np.zeros(0, np.int64) for name in ("particle_a", "particle_b")} | {"link_probability": np.zeros(0)}
+    write_points(
+        tmp_path / "t.vtkhdf", TRACKS_FORMAT, Points(np.zeros((0, 3)), pair, REFERENCE, {}, {}), overwrite=False
+    )
+    assert read_points(tmp_path / "t.vtkhdf", TRACKS_FORMAT).position_mm.shape == (0, 3)
+
+
+def test_a_full_disk_and_a_folder_that_takes_nothing_are_told(
+    many_tracks: Points, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with pytest.raises(OutputError, match="missing: tracks cannot be put there"):
+        StoredTracks(tmp_path / "missing", REFERENCE, {}, {})
+    full = open("/dev/full", "r+b", buffering=0)  # noqa: SIM115
+    monkeypatch.setattr(particle_file.tempfile, "TemporaryFile", lambda **_: full)
+    with pytest.raises(OutputError, match="No space left"):
+        put(tmp_path, many_tracks)
+
+
+def test_the_last_few_frames_stay_in_memory() -> None:
+    read: list[int] = []
+
+    def frame(number: int) -> Points:
+        read.append(number)
+        arrays = {"covariance_mm2": np.zeros((number, 6)), "intensity": np.ones(number)}
+        return Points(np.zeros((number, 3)), arrays, REFERENCE, {}, {})
+
+    frames = SeenFrames(KEPT_FRAMES + 2, frame)
+    for number in range(len(frames)):
+        for before in range(max(number - KEPT_FRAMES + 1, 0), number + 1):
+            assert len(frames[before]) == before
+    assert read == list(range(len(frames)))
+    # The first one's count is known, and it is read again for more.
+    assert (frames.particles(0), len(read)) == (0, len(frames))
+    assert (len(frames[0]), read[-1]) == (0, 0)

@@ -1,23 +1,26 @@
-"""The shipped pipes at a small size, from simulated images to vectors that are judged."""
-
-from __future__ import annotations
+"""Whole chains at a small size: the shipped pipes, oblique faces, a mid plane that is wrong on purpose."""
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import tifffile
+from scipy.spatial import KDTree
 
-from lfpiv_cli.cli.main import cli
-from lfpiv_cli.files.calibration_file import open_calibration
+from lfpiv_cli.errors import ConfigError
+from lfpiv_cli.files.calibration_file import open_calibration, write_calibration
 from lfpiv_cli.files.config import load_config
+from lfpiv_cli.files.hdf5 import open_h5, read_provenance
 from lfpiv_cli.files.particle_file import open_particles
+from lfpiv_cli.files.particles import read_particles
 from lfpiv_cli.files.vtkhdf import open_vectors
 from lfpiv_cli.files.weights_file import open_weights
 from lfpiv_cli.flow.field import MASKED
 from lfpiv_cli.weights.strips import StripOperator
+from tests.commands import run
 
 CONFIGS = Path(__file__).parent.parent / "configs"
 # What stands in the files, and what makes of them a section of the pipe's middle on a part of the sensor.
@@ -28,10 +31,6 @@ SMALL = {
     r"windows: \[32, 16\]": "windows: [16]",
     r"particles: \d+ .*": "particles: 220\n  rays: 6000",
 }
-
-
-def run(*words: object) -> None:
-    cli.main([str(word) for word in words], standalone_mode=False)
 
 
 def small(folder: Path, name: str, z_mm: float) -> Path:
@@ -154,3 +153,137 @@ def test_a_pipe_that_is_not_where_it_was_said_is_found_and_measured(
     # Measured: 0.0002; behind the scene as it is told more than 0.01.
     assert abs(figures["streamwise_mean_error"]) < 0.003
     assert figures["within_25_percent_vector_inner"] > 0.98
+
+
+ROOT = Path(__file__).parent.parent
+DATA, CONFIG = ROOT / "sample_data", ROOT / "configs" / "sample.yaml"
+WRONG_MM = 0.3
+
+
+@pytest.fixture(scope="module")
+def wrong(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The sample's calibration with its mid plane too far away."""
+    folder = tmp_path_factory.mktemp("refine")
+    stills = ("--white", DATA / "white.tif", "--dark", DATA / "dark.tif", "--board", DATA / "board.tif")
+    run("calibrate-snapshot", CONFIG, *stills, "-o", folder / "calibration.h5")
+    right = open_calibration(folder / "calibration.h5")
+    assert right.mid_plane_z_mm is not None
+    path = folder / "wrong.h5"
+    write_calibration(path, replace(right, mid_plane_z_mm=right.mid_plane_z_mm + WRONG_MM), {}, False)
+    return path
+
+
+@pytest.mark.slow
+def test_a_wrong_mid_plane_is_found_and_mended(wrong: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    image, dark = DATA / "pair_a.tif", ("--dark", DATA / "dark.tif")
+    output, picture = tmp_path / "refined.h5", tmp_path / "walls.png"
+    capsys.readouterr()
+    targets = ("-o", output, "--picture", picture, "--json")
+    run("refine-calibration", CONFIG, image, "--calibration", wrong, *dark, *targets)
+    summary = json.loads(capsys.readouterr().out)
+    truth = json.loads((DATA / "particles.json").read_text())["reference_z_mm"]
+    assert abs(summary["mid_plane_z_mm"] - truth) < 3 * summary["mid_plane_z_mm_sigma"]
+    assert summary["mid_plane_z_mm_sigma"] < 0.03
+    assert summary["mid_plane_correction_mm"] == pytest.approx(-WRONG_MM, abs=0.06)
+    mended = open_calibration(output)
+    assert mended.mid_plane_z_mm == summary["mid_plane_z_mm"]
+    assert mended.pose is not None
+    moved = mended.fit.centres((3, -2)) - open_calibration(wrong).fit.centres((3, -2))
+    np.testing.assert_allclose(moved, summary["lattice_shift_px"], atol=1e-12)
+    # The shipped images belong together: nothing has moved, and the tracers are 0.05 mm wide.
+    assert np.abs(moved).max() < 0.01
+    assert abs(summary["particle_diameter_mm"] - 0.05) < 3 * summary["particle_diameter_mm_sigma"]
+    with open_h5(output) as file:
+        made_by = read_provenance(file)
+    assert made_by["command"] == "refine-calibration"
+    assert {"calibration", "image", "dark"} <= set(made_by["inputs"])
+    assert picture.stat().st_size > 10_000
+
+
+@pytest.mark.slow
+def test_half_a_millimetre_on_the_recorded_pair(
+    data_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    data, config = data_folder / "channel", ROOT / "configs" / "channel.yaml"
+    dark, off = ("--dark", data / "dark.tif"), tmp_path / "off.h5"
+    stills = ("--white", data / "white.tif", "--board", data / "board.tif")
+    run("calibrate-snapshot", config, *stills, *dark, "-o", tmp_path / "calibration.h5")
+    right = open_calibration(tmp_path / "calibration.h5")
+    assert right.mid_plane_z_mm is not None
+    moved = replace(right.rectification, fit=right.fit.shifted(np.array([0.2, -0.1])))
+    write_calibration(off, replace(right, rectification=moved, mid_plane_z_mm=right.mid_plane_z_mm + 0.5), {}, False)
+    capsys.readouterr()
+    run("refine-calibration", config, data / "pair_a.tif", "--calibration", off, *dark, "--json")
+    summary = json.loads(capsys.readouterr().out)
+    truth = json.loads((data / "truth.json").read_text())
+    # Measured: 0.002 mm and 0.0004 px are left.
+    left = summary["mid_plane_z_mm"] - truth["mid_plane_z_mm"]
+    assert abs(left) < min(0.02, 2 * summary["mid_plane_z_mm_sigma"])
+    np.testing.assert_allclose(summary["lattice_shift_px"], (-0.2, 0.1), atol=4e-3)
+    assert np.all(np.abs(summary["wall_tilt_deg"]) < 2 * np.array(summary["wall_tilt_deg_sigma"]))
+    for name, true in (("magnification", -1.0), ("aperture_mm", 25.0), ("particle_diameter_mm", 0.05)):
+        assert abs(summary[name] - true) < 2 * summary[f"{name}_sigma"], name
+    assert abs(summary["k1_per_mm2"] - truth["camera"]["k1"]) < 2 * summary["k1_per_mm2_sigma"]
+
+
+@pytest.mark.thorough
+def test_a_config_without_a_channel_is_refused(wrong: Path, tmp_path: Path) -> None:
+    config = tmp_path / "rig.yaml"
+    lines = [line for line in CONFIG.read_text().splitlines() if not line.startswith("channel")]
+    config.write_text("\n".join(lines).replace("reference: mid_plane", "reference: focal_point"))
+    with pytest.raises(ConfigError, match="channel: is missing"):
+        run("refine-calibration", config, DATA / "pair_a.tif", "--calibration", wrong)
+
+
+RIG = """\
+camera:
+  main_lens:   {{magnification: -1.0, focal_length_mm: 100.0, aperture_mm: 25.0}}
+  microlenses: {{focal_length_mm: 0.8, pitch_mm: 0.1, columns: 252, rows: 252, layout: square}}
+  sensor:      {{pixel_um: 5.5, columns: 460, rows: 420, microlens_distance_mm: 0.8}}
+media: {{air: 1.0, window: 1.52, fluid: 1.33}}
+scene:
+  - {{{outer}, behind: window}}
+  - {{{inner}, behind: fluid}}
+volume: {{shape_xyz: [14, 12, 30], voxel_mm: 0.1, centre_mm: [{centre}]}}
+reconstruction: {{solver: particles, particle_diameter_mm: 0.05}}
+correlation:    {{windows: [8], overlap: 0.5, dt_s: 0.001}}
+simulation:
+  flow: {{kind: uniform, velocity_m_s: [0.06, -0.04, 0.09]}}
+  particles: 24
+  particle_diameter_mm: 0.05
+  seed: {seed}
+"""
+TILTED = "kind: tilted_plane, normal: [0.3, 0.12, 1], point_mm: [0, 0, {z}]"
+BOWL = "kind: sphere, centre_mm: [2, -1, 8], radius_mm: {radius}"
+SCENES = {
+    # Oblique water moves what is in view to the side.
+    "tilted": (TILTED.format(z=-8), TILTED.format(z=-5), "1.0, 0.4, 2.7"),
+    "bowl": (BOWL.format(radius=15), BOWL.format(radius=13), "0, 0, 2.7"),
+}
+# Of one particle in x, y and z, several of their errors.
+NEAR_MM = np.array([0.03, 0.03, 0.15])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scene", SCENES)
+def test_tracers_are_found_where_they_are(tmp_path: Path, scene: str) -> None:
+    outer, inner, centre = SCENES[scene]
+    rig = tmp_path / "rig.yaml"
+    rig.write_text(RIG.format(outer=outer, inner=inner, centre=centre, seed=8140))
+    run("simulate", "particles", rig, "-o", tmp_path / "sim")
+    run("simulate", "white", rig, "-o", tmp_path / "white")
+    run("build-weights", rig, "-o", tmp_path / "weights.h5")
+    images, dark = (tmp_path / "sim" / f"pair_{k}.tif" for k in "ab"), tmp_path / "white" / "dark.tif"
+    run("reconstruct", tmp_path / "weights.h5", *images, "--dark", dark, "-o", tmp_path / "parts")
+    truth = read_particles(tmp_path / "sim" / "particles.npz").frame_positions_mm
+    middle, inside = np.array([float(each) for each in centre.split(",")]), np.array([0.7, 0.6, 1.5])
+    there, found = [], []
+    for k, name in enumerate(("pair_a", "pair_b")):
+        here = truth[k][np.all(np.abs(truth[k] - middle) < inside, axis=1)]
+        points = open_particles(tmp_path / "parts" / f"{name}.vtkhdf").position_mm
+        points_here = points[np.all(np.abs(points - middle) < inside, axis=1)]
+        there.append(KDTree(points / NEAR_MM).query(here / NEAR_MM)[0] < 1.0)
+        found.append(KDTree(truth[k] / NEAR_MM).query(points_here / NEAR_MM)[0] < 1.0)
+    # All of it lies on one side of the focus, where light tells depth; an edge of the volume may still cut some off.
+    assert np.concatenate(there).mean() >= 0.95
+    assert np.concatenate(found).mean() >= 0.95

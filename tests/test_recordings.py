@@ -1,17 +1,17 @@
 """Files of frames: each format read as it is laid out, refused by its name where it is cut or hostile."""
 
-from __future__ import annotations
-
 import hashlib
 import itertools
 import os
 import re
+import shutil
 import struct
 import sys
 import time
 import zlib
 from collections.abc import Callable
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 
 import h5py
@@ -23,24 +23,17 @@ from lfpiv_cli.errors import InputError, UsageError
 from lfpiv_cli.files import images
 from lfpiv_cli.files.inputs import split_part
 from lfpiv_cli.files.provenance import record, sha256
-from lfpiv_cli.files.recordings import formats
 from lfpiv_cli.files.recordings.recording import PACKED_BITS, PATTERNS, Packing, Pixels, green_of
 from tests import camera_files
 
 
-def test_a_sequence_is_looked_through_once_and_again_when_it_changes(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    stack = np.arange(5 * 12, dtype=np.uint8).reshape(5, 3, 4)
-    path, walks = tmp_path / "t.tif", []
-    monkeypatch.setattr(
-        formats, "directories", lambda *given, walk=formats.directories: walks.append(1) or walk(*given)
-    )
+def test_a_sequence_is_looked_through_and_again_when_it_changes(tmp_path: Path) -> None:
+    stack, path = np.arange(5 * 12, dtype=np.uint8).reshape(5, 3, 4), tmp_path / "t.tif"
     tifffile.imwrite(path, stack, photometric="minisblack", metadata=None)
+    found = images.frames(path)
+    assert (found.pages, found.shape, found.bits, found.time_s) == (5, (3, 4), 8, None)
     for page in (3, 0, 4):
         np.testing.assert_array_equal(images.read_image(path, page, (3, 4)), stack[page])
-    assert images.count_pages(path) == 5
-    assert len(walks) == 1
     for page in (-1, 5):
         with pytest.raises(InputError, match=f"has no page {page}, it holds 5"):
             images.read_image(path, page)
@@ -48,14 +41,6 @@ def test_a_sequence_is_looked_through_once_and_again_when_it_changes(
     tifffile.imwrite(path, stack[::-1], photometric="minisblack", metadata=None)
     os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns + 1))
     np.testing.assert_array_equal(images.read_image(path, 3), stack[1])
-    assert len(walks) == 2
-
-
-def test_a_header_tells_shape_and_bits(tmp_path: Path) -> None:
-    tifffile.imwrite(tmp_path / "t.tif", np.zeros((2, 3, 4), np.uint16), photometric="minisblack", metadata=None)
-    recording = images.frames(tmp_path / "t.tif")
-    assert (recording.pages, recording.shape, recording.bits) == (2, (3, 4), 16)
-    assert images.frames(tmp_path / "t.tif").time_s is None
 
 
 def stack_of(rng: np.random.Generator, bits: int, shape: tuple[int, int, int] = (3, 5, 7)) -> np.ndarray:
@@ -67,52 +52,40 @@ def read_all(path: Path) -> None:
         images.read_image(path, page)
 
 
-def kinds(folder: Path, rng: np.random.Generator) -> dict[str, tuple[Path, np.ndarray]]:
-    """Write a recording of each kind; return where, and what is in it."""
-    wide, narrow, ten, twelve = (stack_of(rng, bits) for bits in (16, 8, 10, 12))
-    camera_files.write_cine(folder / "c16.cine", wide, notes=b"range data")
-    camera_files.write_cine(folder / "c8.cine", narrow, version=0)
-    camera_files.write_cine(folder / "c12.cine", twelve, packed=12)
-    camera_files.write_seq(folder / "s16.seq", wide)
-    camera_files.write_seq(folder / "s8.seq", narrow, version=3)
-    camera_files.write_mraw(folder / "m16.mraw", wide, bits=16)
-    camera_files.write_mraw(folder / "m8.mraw", narrow, bits=8, xml=False)
-    camera_files.write_mraw(folder / "m12.mraw", twelve, bits=12)
-    camera_files.write_mraw(folder / "m10.mraw", ten, bits=10, xml=False)
-    camera_files.write_stack(folder / "h.h5", wide)
-    (folder / "r.raw").write_bytes(b"".join(camera_files.bits_low_first(frame, 12) for frame in twelve))
-    found = {name: (folder / name, wide) for name in ("c16.cine", "s16.seq", "m16.mraw", "h.h5")}
-    found |= {name: (folder / name, narrow) for name in ("c8.cine", "s8.seq", "m8.mraw")}
-    found |= {name: (folder / name, twelve) for name in ("c12.cine", "m12.mraw")}
-    return found | {
-        "m10.mraw": (folder / "m10.mraw", ten),
-        "r.raw": (folder / "r.raw:7x5x12:packing=low-first:rate=2000", twelve),
-        "h.h5 named": (folder / "h.h5:/entry/data/frames", wide),
-    }
+KINDS: dict[str, tuple[int, Callable[..., object], str]] = {
+    "c16.cine": (16, partial(camera_files.write_cine, notes=b"range data"), ""),
+    "c8.cine": (8, partial(camera_files.write_cine, version=0), ""),
+    "c12.cine": (12, partial(camera_files.write_cine, packed=12), ""),
+    "s16.seq": (16, camera_files.write_seq, ""),
+    "s8.seq": (8, partial(camera_files.write_seq, version=3), ""),
+    "m16.mraw": (16, partial(camera_files.write_mraw, bits=16), ""),
+    "m8.mraw": (8, partial(camera_files.write_mraw, bits=8, xml=False), ""),
+    "m12.mraw": (12, partial(camera_files.write_mraw, bits=12), ""),
+    "m10.mraw": (10, partial(camera_files.write_mraw, bits=10, xml=False), ""),
+    "h.h5": (16, camera_files.write_stack, ""),
+    "h.h5 named": (16, camera_files.write_stack, ":/entry/data/frames"),
+    "r.raw": (
+        12,
+        lambda path, stack: path.write_bytes(b"".join(camera_files.bits_low_first(frame, 12) for frame in stack)),
+        ":7x5x12:packing=low-first:rate=2000",
+    ),
+}
 
 
-KINDS = (
-    "c16.cine",
-    "c8.cine",
-    "c12.cine",
-    "s16.seq",
-    "s8.seq",
-    "m16.mraw",
-    "m8.mraw",
-    "m12.mraw",
-    "m10.mraw",
-    "h.h5",
-    "r.raw",
-    "h.h5 named",
-)
+def written(kind: str, folder: Path, rng: np.random.Generator) -> tuple[Path, np.ndarray]:
+    """Write a recording of a kind; return where, and what is in it."""
+    bits, write, part = KINDS[kind]
+    path, stack = folder / kind.split()[0], stack_of(rng, bits)
+    write(path, stack)
+    return Path(f"{path}{part}"), stack
 
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("kind", KINDS)
-def test_each_format_gives_the_counts_and_times_that_were_written(
+def test_each_format_gives_the_counts_and_times_that_were_written_and_pages_as_images(
     tmp_path: Path, rng: np.random.Generator, kind: str
 ) -> None:
-    path, stack = kinds(tmp_path, rng)[kind]
+    path, stack = written(kind, tmp_path, rng)
     found = images.frames(path)
     assert (found.pages, found.shape) == (3, (5, 7))
     for page in range(3):
@@ -120,15 +93,22 @@ def test_each_format_gives_the_counts_and_times_that_were_written(
         assert image.dtype == np.float32
         np.testing.assert_array_equal(image, stack[page])
     # Norpix' older versions have milliseconds.
-    second = 0.0 if kind == "s8.seq" else 0.0005
-    np.testing.assert_allclose(images.frames(path).time_s, [0.0, second, 0.001], rtol=0, atol=1e-9)
+    times_s = [0.0, 0.0 if kind == "s8.seq" else 0.0005, 0.001]
+    np.testing.assert_allclose(images.frames(path).time_s, times_s, rtol=0, atol=1e-9)
     with pytest.raises(InputError, match=r"7 x 5 pixels.*, expected the sensor's 8 x 5"):
         images.read_image(path, 0, (5, 8))
+    with pytest.raises(InputError, match="holds 3 pages, expected a single image; .*:page=0 is the first one"):
+        images.read_single(path)
+    one = Path(f"{path}:page=2")
+    np.testing.assert_array_equal(images.read_single(one, (5, 7)), stack[2])
+    np.testing.assert_array_equal(images.frames(one).time_s, images.frames(path).time_s[2:])
+    with pytest.raises(InputError, match="has no page 3, it holds 3"):
+        images.read_single(Path(f"{path}:page=3"))
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_recording_cut_anywhere_is_refused_by_its_name(tmp_path: Path, rng: np.random.Generator, kind: str) -> None:
-    given, _ = kinds(tmp_path, rng)[kind]
+    given, _ = written(kind, tmp_path, rng)
     path, _ = split_part(given)
     content = path.read_bytes()
     # A sequence's frames are padded, and what is cut off the last one's padding is not missed; frames without a header
@@ -144,19 +124,6 @@ def test_a_recording_cut_anywhere_is_refused_by_its_name(tmp_path: Path, rng: np
             images.frames(given)
 
 
-def naive(data: bytes, bits: int, count: int, high_first: bool) -> list[int]:
-    """Unpack bit by bit."""
-    numbers = []
-    for k in range(count):
-        number = 0
-        for j in range(bits):
-            byte, place = divmod(k * bits + j, 8)
-            bit = data[byte] >> (7 - place if high_first else place) & 1
-            number = number << 1 | bit if high_first else number | bit << j
-        numbers.append(number)
-    return numbers
-
-
 @pytest.mark.parametrize("bits", PACKED_BITS)
 @pytest.mark.parametrize("packing", ["high-first", "low-first"])
 @pytest.mark.parametrize("columns", [1, 4, 7, 8])
@@ -164,16 +131,19 @@ def test_packed_pixels_are_what_their_bits_say_one_by_one(
     rng: np.random.Generator, bits: int, packing: Packing, columns: int
 ) -> None:
     pixels = Pixels((3, columns), bits, packing)
-    data = rng.bytes(pixels.frame_bytes)
-    expected = naive(data, bits, 3 * columns, packing == "high-first")
+    data, expected = rng.bytes(pixels.frame_bytes), []
+    for k in range(3 * columns):
+        number = 0
+        for j in range(bits):
+            byte, place = divmod(k * bits + j, 8)
+            bit = data[byte] >> (7 - place if packing == "high-first" else place) & 1
+            number = number << 1 | bit if packing == "high-first" else number | bit << j
+        expected.append(number)
     np.testing.assert_array_equal(pixels.decode(data).ravel(), expected)
-
-
-@pytest.mark.parametrize("bits", PACKED_BITS)
-def test_gige_packs_two_pixels_in_three_bytes(rng: np.random.Generator, bits: int) -> None:
-    stack = stack_of(rng, bits, (1, 5, 7))
-    assert Pixels((5, 7), bits, "gige").frame_bytes == len(camera_files.gige(stack, bits))
-    np.testing.assert_array_equal(Pixels((5, 7), bits, "gige").decode(camera_files.gige(stack, bits)), stack[0])
+    # GigE's way packs two pixels in three bytes.
+    stack, gige = stack_of(rng, bits, (1, 5, 7)), Pixels((5, 7), bits, "gige")
+    assert gige.frame_bytes == len(camera_files.gige(stack, bits))
+    np.testing.assert_array_equal(gige.decode(camera_files.gige(stack, bits)), stack[0])
 
 
 def test_a_cine_packed_to_ten_bits_has_linear_counts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -190,7 +160,7 @@ def test_a_cine_packed_to_ten_bits_has_linear_counts(tmp_path: Path, monkeypatch
         images.frames(tmp_path / "t.cine")
 
 
-def test_images_of_davis(tmp_path: Path, rng: np.random.Generator) -> None:
+def test_images_and_sets_of_davis(tmp_path: Path, rng: np.random.Generator) -> None:
     lvpyio = pytest.importorskip("lvpyio")
     path = tmp_path / "B00001.im7"
     for packed, kind in itertools.product((True, False), (np.uint16, np.float32)):
@@ -208,11 +178,13 @@ def test_images_of_davis(tmp_path: Path, rng: np.random.Generator) -> None:
             with pytest.raises(InputError, match="B00001.im7"):
                 images.frames(path)
         if packed:
-            flipped = bytearray(content)
-            flipped[end // 2] ^= 1
-            path.write_bytes(flipped)
+            edited(path, end // 2, "B", content[end // 2] ^ 1, content)
             with pytest.raises(InputError, match=r"B00001\.im7: (cannot be unpacked|does not unpack)"):
                 images.read_image(path, 0)
+    stacks = [stack_of(rng, 12, (2, 30, 40)) for _ in range(3)]
+    lvpyio.write_set([lvpyio.arrays_to_buffer(list(stack)) for stack in stacks], str(tmp_path / "run.set"))
+    for page, expected in enumerate(np.concatenate(stacks)):
+        np.testing.assert_array_equal(images.read_image(tmp_path / "run.set", page), expected)
 
 
 @pytest.mark.parametrize(
@@ -244,6 +216,12 @@ def test_packed_images_of_davis_end_with_their_check_sum(tmp_path: Path, rng: np
     edited(path, 256, "<I", length - 2)
     with pytest.raises(InputError, match="does not unpack to 3 frames"):
         images.read_image(path, 1)
+    path, _ = written("c8.cine", tmp_path, rng)
+    with pytest.raises(UsageError, match="have no parts or layouts"):
+        images.frames(path.with_name("c8.cine:7x5x8"))
+    (tmp_path / "t.dat").write_bytes(b"?")
+    with pytest.raises(InputError, match="neither a TIFF nor a PNG image, nor a recording of HDF5, Phantom cine"):
+        images.frames(tmp_path / "t.dat:/entry")
 
 
 def test_a_set_of_davis_is_the_frames_of_its_images_one_after_the_other(
@@ -267,44 +245,27 @@ def test_a_set_of_davis_is_the_frames_of_its_images_one_after_the_other(
         images.read_image(path, 2)
 
 
-def test_sets_as_lavision_writes_them(tmp_path: Path, rng: np.random.Generator) -> None:
-    lvpyio = pytest.importorskip("lvpyio")
-    stacks = [stack_of(rng, 12, (2, 30, 40)) for _ in range(3)]
-    lvpyio.write_set([lvpyio.arrays_to_buffer(list(stack)) for stack in stacks], str(tmp_path / "run.set"))
-    for page, expected in enumerate(np.concatenate(stacks)):
-        np.testing.assert_array_equal(images.read_image(tmp_path / "run.set", page), expected)
-
-
-def _only_vectors(folder: Path) -> None:
-    for file in folder.iterdir():
-        file.rename(file.with_suffix(".vc7"))
-
-
-def _set_in_set(folder: Path) -> None:
-    folder.rename(folder.with_name("S00001"))
-    folder.mkdir()
-    folder.with_name("S00001").rename(folder / "S00001")
-
-
 SETS: dict[str, tuple[Callable[[Path], object], str]] = {
     "no folder": (lambda folder: folder.rename(folder.with_name("other")), "folder of its images, run, is not beside"),
     "gap": (lambda folder: (folder / "B00002.im7").unlink(), r"B00003\.im7 is not the next image after B00001\.im7"),
     "first": (lambda folder: (folder / "B00001.im7").unlink(), r"first image is B00002\.im7, and those before"),
     "twice": (lambda folder: (folder / "B2.im7").write_bytes(b"x"), r"im7 has the same number as B.*2\.im7"),
     "empty": (lambda folder: [file.unlink() for file in folder.iterdir()], r"no images B00001\.im7, .*: save it from"),
-    "vectors": (_only_vectors, r"but \.vc7 files: save it from DaVis as a set of \.im7 images, or as TIFF"),
-    "sets": (_set_in_set, "holds several sets: give one of these folders, as .*S00001"),
+    "vectors": (
+        lambda folder: [file.rename(file.with_suffix(".vc7")) for file in folder.iterdir()],
+        r"but \.vc7 files: save it from DaVis as a set of \.im7 images, or as TIFF",
+    ),
+    "sets": (
+        lambda folder: shutil.copytree(folder, folder / "S00001") and [f.unlink() for f in folder.glob("*.*")],
+        "holds several sets: give one of these folders, as .*S00001",
+    ),
     "archive": (lambda folder: folder.with_suffix(".set").write_bytes(b"PK\3\4\0\0"), "is no text .*or as TIFF"),
     "size": (
         lambda folder: camera_files.write_im7(folder / "B00002.im7", np.zeros((1, 5, 8), np.uint16)),
         r"B00002\.im7: has .*\(5, 8\), the first image of its set \(5, 7\)",
     ),
-    "cut": (lambda folder: _cut(folder / "B00003.im7"), r"B00003\.im7: .*cut off"),
+    "cut": (lambda folder: os.truncate(folder / "B00003.im7", os.path.getsize(folder / "B00003.im7") - 20), "cut off"),
 }
-
-
-def _cut(path: Path) -> None:
-    path.write_bytes(path.read_bytes()[:-20])
 
 
 @pytest.mark.parametrize("fault", SETS)
@@ -331,10 +292,11 @@ def test_the_record_of_a_set_changes_with_each_of_its_images(tmp_path: Path) -> 
     assert beside() != first
 
 
-def edited(path: Path, place: int, layout: str, value: int) -> None:
-    content = bytearray(path.read_bytes())
-    struct.pack_into(layout, content, place, value)
-    path.write_bytes(content)
+def edited(path: Path, place: int, layout: str, value: int, content: bytes | None = None) -> None:
+    """Put a number into a file, or into what was in it."""
+    changed = bytearray(path.read_bytes() if content is None else content)
+    struct.pack_into(layout, changed, place, value)
+    path.write_bytes(changed)
 
 
 # Where a header has a number, as in `camera_files`, what a hostile one says, and how it is refused.
@@ -362,43 +324,15 @@ HOSTILE = {
 @pytest.mark.parametrize("what", HOSTILE)
 def test_hostile_headers_are_refused_quickly(tmp_path: Path, rng: np.random.Generator, what: str) -> None:
     name, place, layout, value, words = HOSTILE[what]
-    path, _ = kinds(tmp_path, rng)[name]
+    path, _ = written(name, tmp_path, rng)
     edited(path, place, layout, value)
     began = time.monotonic()
-    with pytest.raises(InputError, match=words) as raised:
+    with pytest.raises(InputError, match=rf"{name}.*{words}"):
         read_all(path)
-    assert name in str(raised.value)
     assert time.monotonic() - began < 1.0
 
 
-def test_places_and_notes_of_a_cine_must_lie_in_it(tmp_path: Path, rng: np.random.Generator) -> None:
-    path, stack = tmp_path / "t.cine", stack_of(rng, 16, (2, 4, 6))
-    for wrong in (-1, 2**40):
-        camera_files.write_cine(path, stack)
-        content = path.read_bytes()
-        (places_at,) = struct.unpack_from("<I", content, 32)
-        first, second = struct.unpack_from("<2q", content, places_at)
-        edited(path, places_at, "<q", wrong)
-        with pytest.raises(InputError, match=r"t\.cine: declares 2 frames"):
-            images.frames(path)
-    for place, value, words in (
-        (0, 0, "notes of the frame"),
-        (0, 2**31, "ends at byte"),
-        (4, 3, "declares 3 bytes, expected 48"),
-    ):
-        # Of the last frame before any is read, of others in their turn.
-        camera_files.write_cine(path, stack)
-        edited(path, second + place, "<I", value)
-        with pytest.raises(InputError, match=words):
-            images.frames(path)
-        camera_files.write_cine(path, stack)
-        edited(path, first + place, "<I", value)
-        np.testing.assert_array_equal(images.read_image(path, 1), stack[1])
-        with pytest.raises(InputError, match=words):
-            images.read_image(path, 0)
-
-
-def test_other_ways_of_writing_a_cine(tmp_path: Path, rng: np.random.Generator) -> None:
+def test_ways_of_writing_a_cine_and_what_must_lie_in_it(tmp_path: Path, rng: np.random.Generator) -> None:
     path, stack = tmp_path / "t.cine", stack_of(rng, 8, (2, 4, 5))
     camera_files.write_cine(path, stack, times=False, tight=True)
     np.testing.assert_array_equal(images.read_image(path, 1), stack[1])
@@ -408,6 +342,28 @@ def test_other_ways_of_writing_a_cine(tmp_path: Path, rng: np.random.Generator) 
     camera_files.write_cine(path, stack, filters=3)
     with pytest.raises(InputError, match="frames of a colour sensor.*bayer=RGGB"):
         images.frames(path)
+    path, stack = tmp_path / "t.cine", stack_of(rng, 16, (2, 4, 6))
+    camera_files.write_cine(path, stack)
+    content = path.read_bytes()
+    (places_at,) = struct.unpack_from("<I", content, 32)
+    first, second = struct.unpack_from("<2q", content, places_at)
+    for wrong in (-1, 2**40):
+        edited(path, places_at, "<q", wrong, content)
+        with pytest.raises(InputError, match=r"t\.cine: declares 2 frames"):
+            images.frames(path)
+    for place, value, words in (
+        (0, 0, "notes of the frame"),
+        (0, 2**31, "ends at byte"),
+        (4, 3, "declares 3 bytes, expected 48"),
+    ):
+        # Of the last frame before any is read, of others in their turn.
+        edited(path, second + place, "<I", value, content)
+        with pytest.raises(InputError, match=words):
+            images.frames(path)
+        edited(path, first + place, "<I", value, content)
+        np.testing.assert_array_equal(images.read_image(path, 1), stack[1])
+        with pytest.raises(InputError, match=words):
+            images.read_image(path, 0)
 
 
 CIH = "Total Frame : 1\nImage Width : 7\nImage Height : 5\nColor Type : Mono\nColor Bit : 8\n"
@@ -436,27 +392,21 @@ def test_headers_of_photron_that_do_not_fit(tmp_path: Path, header: str, words: 
         images.frames(path)
 
 
-def test_xml_that_declares_entities_or_ends_early_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "t.mraw").write_bytes(bytes(35))
-    for text in ("<cih><frameInfo>", "<cih><a></cih>", '<!DOCTYPE cih [<!ENTITY a "b">]><cih>&a;</cih>'):
-        (tmp_path / "t.cihx").write_text(text)
-        with pytest.raises(InputError, match=r"t\.cihx: "):
-            images.frames(tmp_path / "t.mraw")
-
-
-def test_a_header_that_changes_is_read_anew(tmp_path: Path) -> None:
+def test_a_header_is_looked_through_once_and_again_when_it_changes(tmp_path: Path) -> None:
     path = tmp_path / "t.mraw"
     path.write_bytes(bytes(35))
     path.with_suffix(".cih").write_text(CIH)
     assert images.frames(path).shape == (5, 7)
     path.with_suffix(".cih").write_text(CIH.replace("Width : 7", "Width : 5") + "\n")
     assert images.frames(path).shape == (5, 5)
-
-
-def test_a_photron_recording_that_left_frames_out_is_timed_by_what_it_kept(tmp_path: Path) -> None:
     (tmp_path / "t.mraw").write_bytes(bytes(70))
     (tmp_path / "t.cih").write_text(CIH.replace("e : 1", "e : 2") + "Record Rate(fps) : 1000\nSave Step : 5\n")
     np.testing.assert_allclose(images.frames(tmp_path / "t.mraw").time_s, [0.0, 0.005])
+    (tmp_path / "t.mraw").write_bytes(bytes(35))
+    for text in ("<cih><frameInfo>", "<cih><a></cih>", '<!DOCTYPE cih [<!ENTITY a "b">]><cih>&a;</cih>'):
+        (tmp_path / "t.cihx").write_text(text)
+        with pytest.raises(InputError, match=r"t\.cihx: "):
+            images.frames(tmp_path / "t.mraw")
 
 
 @pytest.mark.parametrize(
@@ -543,18 +493,9 @@ def test_stacks_that_are_refused(tmp_path: Path, rng: np.random.Generator) -> No
         assert "t.h5" in str(raised.value)
 
 
-def test_a_part_of_a_format_without_parts(tmp_path: Path, rng: np.random.Generator) -> None:
-    path, _ = kinds(tmp_path, rng)["c8.cine"]
-    with pytest.raises(UsageError, match="have no parts or layouts"):
-        images.frames(path.with_name("c8.cine:7x5x8"))
-    (tmp_path / "t.dat").write_bytes(b"?")
-    with pytest.raises(InputError, match="neither a TIFF nor a PNG image, nor a recording of HDF5, Phantom cine"):
-        images.frames(tmp_path / "t.dat:/entry")
-
-
 @pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="the system does not list what is open")
 def test_nothing_stays_open(tmp_path: Path, rng: np.random.Generator) -> None:
-    recordings = [path for path, _ in kinds(tmp_path, rng).values()]
+    recordings = [written(kind, tmp_path, rng)[0] for kind in KINDS]
     read_all(recordings[0])
     before = len(list(Path("/proc/self/fd").iterdir()))
     for path in recordings:
@@ -562,22 +503,10 @@ def test_nothing_stays_open(tmp_path: Path, rng: np.random.Generator) -> None:
     assert len(list(Path("/proc/self/fd").iterdir())) <= before
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_one_page_of_any_recording_is_an_image(tmp_path: Path, rng: np.random.Generator, kind: str) -> None:
-    given, stack = kinds(tmp_path, rng)[kind]
-    with pytest.raises(InputError, match="holds 3 pages, expected a single image; .*:page=0 is the first one"):
-        images.read_single(given)
-    one = Path(f"{given}:page=2")
-    np.testing.assert_array_equal(images.read_single(one, (5, 7)), stack[2])
-    np.testing.assert_array_equal(images.frames(one).time_s, images.frames(given).time_s[2:])
-    with pytest.raises(InputError, match="has no page 3, it holds 3"):
-        images.read_single(Path(f"{given}:page=3"))
-
-
 @pytest.mark.thorough
 @pytest.mark.parametrize("kind", KINDS)
 def test_mutated_headers_raise_nothing_else(tmp_path: Path, rng: np.random.Generator, kind: str) -> None:
-    given, _ = kinds(tmp_path, rng)[kind]
+    given, _ = written(kind, tmp_path, rng)
     path, _ = split_part(given)
     header = path if path.suffix != ".mraw" else next(path.parent.glob(f"{path.stem}.cih*"))
     content = header.read_bytes()

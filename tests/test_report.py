@@ -1,11 +1,10 @@
-"""`report`: what is found in a folder, the page made of it, and what a browser makes of the page."""
-
-from __future__ import annotations
+"""`report` and `plot`: what is found in a folder, the figures of each kind of file, the page made of them."""
 
 import re
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from click.testing import CliRunner
@@ -13,16 +12,27 @@ from click.testing import CliRunner
 from lfpiv_cli.cli.main import cli
 from lfpiv_cli.console import Console
 from lfpiv_cli.errors import InputError, OutputExistsError, UsageError
+from lfpiv_cli.files.config import load_config
+from lfpiv_cli.files.hdf5 import write_tree
 from lfpiv_cli.files.images import write_tiff
-from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, TRACKS_FORMAT, Points, write_points
+from lfpiv_cli.files.particle_file import (
+    PARTICLES_FORMAT,
+    TRACKS_FORMAT,
+    TRAJECTORIES_FORMAT,
+    UNITS,
+    Points,
+    write_points,
+)
 from lfpiv_cli.files.provenance import sha256
-from lfpiv_cli.files.vtkhdf import write_vectors
+from lfpiv_cli.files.vtkhdf import write_vectors, write_volume
+from lfpiv_cli.grid import Grid
 from lfpiv_cli.pictures.points import MOST_LINES, lines_view
 from lfpiv_cli.reference import Reference
 from lfpiv_cli.verbs import report as stage
 from lfpiv_cli.verbs.plot import figures_of
 from lfpiv_cli.verbs.report import ReportOptions, contents_of, report
 from tests.browser import CHROMIUM, opened
+from tests.commands import ROOT, run, table2_rig, told
 from tests.vector_fields import SHAPE, SIGMA_VOXEL, field_of, noise_mm, rotation_mm
 
 QUIET = Console(quiet=True)
@@ -68,23 +78,18 @@ def few_figures(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(stage, "figures_of", lambda *given: dict([next(iter(figures_of(*given).items()))]))
 
 
-def test_contents_are_in_the_order_of_the_chain(results: Path) -> None:
+def test_contents_are_in_the_order_of_the_chain_and_broken_files_are_named(results: Path, tmp_path: Path) -> None:
     found = contents_of(results)
     assert [path.name for path in found.of("vectors")] == ["grid.vtkhdf", "vectors.vtkhdf"]
     assert list(found.records) == ["tracked/grid.vtkhdf", "vectors.vtkhdf", "tracks.vtkhdf"]
-
-
-def test_a_folder_without_results_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="holds no file of lfpiv"):
-        contents_of(tmp_path)
-    with pytest.raises(InputError, match="is no folder"):
-        contents_of(tmp_path / "none")
-
-
-def test_a_broken_file_is_named(results: Path) -> None:
     (results / "volume.vtkhdf").write_bytes(b"\x89HDF\r\n\x1a\n broken")
     with pytest.raises(InputError, match=r"volume\.vtkhdf"):
         contents_of(results)
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(InputError, match="holds no file of lfpiv"):
+        contents_of(tmp_path / "empty")
+    with pytest.raises(InputError, match="is no folder"):
+        contents_of(tmp_path / "none")
 
 
 @pytest.mark.thorough
@@ -97,9 +102,12 @@ def test_the_page_holds_all(results: Path, tmp_path: Path) -> None:
         assert words in text
     assert "a &lt;b&gt;: too few" in text
     assert text.count('<figure><img src="data:image/png;base64,') == summary["pictures"]
+    outcome = CliRunner().invoke(cli, ["report", str(results), "-o", str(tmp_path / "again.html")])
+    assert outcome.exit_code == 0, outcome.output
+    assert re.search(r"verdict +calibration look, images look, vectors look", outcome.stdout)
 
 
-def test_a_page_is_made_once(results: Path, tmp_path: Path) -> None:
+def test_a_page_is_made_once_and_shows_some_of_many_lines(results: Path, tmp_path: Path) -> None:
     page = tmp_path / "page.html"
     page.write_text("mine")
     with pytest.raises(OutputExistsError):
@@ -107,6 +115,12 @@ def test_a_page_is_made_once(results: Path, tmp_path: Path) -> None:
     assert page.read_text() == "mine"
     with pytest.raises(UsageError, match=r"ends in \.html"):
         report(results, tmp_path / "page.pdf", console=QUIET)
+    pytest.importorskip("plotly")
+    lines = [np.array([[k, 0.0, 0.0], [k, 1.0, 0.0]]) for k in range(3 * MOST_LINES)]
+    values = [np.full(2, 0.1) for _ in lines]
+    few, many = lines_view(lines[:MOST_LINES], values[:MOST_LINES], "m/s"), lines_view(lines, values, "m/s")
+    assert len(many) == pytest.approx(len(few), rel=0.01)
+    assert lines_view([], [], "m/s")
 
 
 def test_pictures_are_drawn_on_the_raw_image_that_a_file_was_made_from(
@@ -171,22 +185,6 @@ def test_of_all_but_the_best_vectors_a_few_figures_are_drawn(
 
 
 @pytest.mark.thorough
-def test_the_command_prints_the_verdict(results: Path, tmp_path: Path) -> None:
-    outcome = CliRunner().invoke(cli, ["report", str(results), "-o", str(tmp_path / "page.html")])
-    assert outcome.exit_code == 0, outcome.output
-    assert re.search(r"verdict +calibration look, images look, vectors look", outcome.stdout)
-
-
-def test_a_view_shows_some_of_many_lines() -> None:
-    pytest.importorskip("plotly")
-    lines = [np.array([[k, 0.0, 0.0], [k, 1.0, 0.0]]) for k in range(3 * MOST_LINES)]
-    values = [np.full(2, 0.1) for _ in lines]
-    few, many = lines_view(lines[:MOST_LINES], values[:MOST_LINES], "m/s"), lines_view(lines, values, "m/s")
-    assert len(many) == pytest.approx(len(few), rel=0.01)
-    assert lines_view([], [], "m/s")
-
-
-@pytest.mark.thorough
 def test_a_browser_sees_the_page_and_loads_nothing(results: Path, tmp_path: Path) -> None:
     if CHROMIUM is None:
         pytest.skip("no Chromium on this machine")
@@ -203,3 +201,107 @@ def test_a_browser_sees_the_page_and_loads_nothing(results: Path, tmp_path: Path
     assert min(widths) > 400
     assert asked == [page.resolve().as_uri()]
     assert (tmp_path / "page.pdf").read_bytes().startswith(b"%PDF")
+
+
+pytest.importorskip("matplotlib")
+
+AT_FOCUS = Reference("focal_point", 0.0)
+N = 12
+
+
+@pytest.fixture
+def config(tmp_path):
+    path = tmp_path / "rig.yaml"
+    path.write_text(table2_rig(240, 200, volume={"shape_xyz": [5, 4, 3], "voxel_mm": [0.1, 0.1, 0.4]}))
+    return path
+
+
+def points(rng: np.random.Generator, of_format: str, provenance: dict) -> Points:
+    """Return points with every array that their format has."""
+    tensors, vectors = ("covariance_mm2",), ("velocity", "velocity_sigma", "displacement_mm")
+    arrays = {
+        name: rng.random((N, 6) if name in tensors else (N, 3) if name in vectors else N) for name in UNITS[of_format]
+    }
+    for name in ("track", "frame", "particle", "particle_a", "particle_b", "flag"):
+        if name in arrays:
+            arrays[name] = np.arange(N) // 3
+    return Points(rng.random((N, 3)), arrays, AT_FOCUS, {}, provenance)
+
+
+@pytest.fixture
+def volume(tmp_path):
+    path = tmp_path / "volume.vtkhdf"
+    grid = Grid.centred((2, 3, 4), (0.1, 0.1, 0.1), (0.0, 0.0, 0.0))
+    array = np.arange(24.0).reshape(4, 3, 2)
+    write_volume(path, array, grid, AT_FOCUS, provenance={}, attributes={}, overwrite=True)
+    return path
+
+
+@pytest.mark.thorough
+def test_pdf_and_png_have_a_figure_for_each_name_and_the_same_bytes_again(volume, tmp_path, capsys):
+    assert told(capsys, "plot", volume, "-o", tmp_path / "v.pdf")["figures"] == ["projections", "depths"]
+    content = (tmp_path / "v.pdf").read_bytes()
+    assert len(re.findall(rb"/Type /Page\b(?!s)", content)) == 2
+    run("plot", volume, "-o", tmp_path / "v.pdf", "--overwrite")
+    assert (tmp_path / "v.pdf").read_bytes() == content
+    run("plot", volume, "-o", tmp_path / "one.png", "--only", "depths")
+    assert cv2.imread(str(tmp_path / "one.png")) is not None
+    found = told(capsys, "plot", volume, "-o", tmp_path / "p.png")
+    assert found["files"] == [str(tmp_path / f"p_{name}.png") for name in ("projections", "depths")]
+    assert sorted(path.name for path in tmp_path.glob("p*.png")) == ["p_depths.png", "p_projections.png"]
+
+
+def test_wrong_names_outputs_and_images_are_refused_before_drawing(volume, tmp_path):
+    for name, options, words in (
+        ("p.png", ("--only", "planes"), "projections, depths"),
+        ("p.jpg", (), r"\.png or \.pdf"),
+        ("p.png", ("--raw", volume), "--raw"),
+    ):
+        with pytest.raises(UsageError, match=words):
+            run("plot", volume, "-o", tmp_path / name, *options)
+    other = tmp_path / "other.h5"
+    write_tree(other, {"a_mm": np.zeros(9)}, format_name="x", format_version=1, provenance={}, overwrite=True)
+    with pytest.raises(InputError, match="x has no figures"):
+        figures_of(other)
+    rng = np.random.default_rng(1)
+    path = tmp_path / "t.vtkhdf"
+    write_points(path, TRACKS_FORMAT, points(rng, TRACKS_FORMAT, {}), overwrite=True)
+    assert list(figures_of(path)) == ["space", "velocities", "links", "sigma"]
+    write_points(path, TRAJECTORIES_FORMAT, points(rng, TRAJECTORIES_FORMAT, {}), overwrite=True)
+    figures = figures_of(path)
+    assert list(figures) == ["space", "lengths", "velocities", "links", "sigma"]
+    assert figures["space"].draw().axes[0].get_title() == "4 trajectories"
+    rows = re.findall(r"^\| ([\w ]+) \| (`.*`) \|$", (ROOT / "docs" / "files.md").read_text(), re.MULTILINE)
+    listed = {what: [name.strip("`") for name in names.split(", ")] for what, names in rows}
+    rng = np.random.default_rng(1)
+    for what, of_format in (("tracks of a pair", TRACKS_FORMAT), ("tracks of a sequence", TRAJECTORIES_FORMAT)):
+        path = tmp_path / "t.vtkhdf"
+        write_points(path, of_format, points(rng, of_format, {}), overwrite=True)
+        assert listed[what] == list(figures_of(path))
+    assert listed["volume"] == list(figures_of(volume))
+    assert len(listed) == 7
+
+
+def test_particles_bring_their_residual_and_weights_their_middle_voxel(config, tmp_path):
+    path, raw = tmp_path / "a.vtkhdf", tmp_path / "raw.tif"
+    made = {"command": "reconstruct", "config": load_config(config).resolved()}
+    write_points(path, PARTICLES_FORMAT, points(np.random.default_rng(1), PARTICLES_FORMAT, made), overwrite=True)
+    assert list(figures_of(path)) == ["places", "depths", "chi2"]
+    write_tiff(tmp_path / "a_residual.tif", np.ones((200, 240), np.float32), overwrite=True)
+    write_tiff(raw, np.ones((200, 240), np.uint16), overwrite=True)
+    figures = figures_of(path, raw)
+    assert list(figures) == ["places", "image", "residual", "depths", "chi2"]
+    assert len(figures["image"].draw().axes[0].collections[0].get_offsets()) == N
+    write_tiff(raw, np.ones((20, 20), np.uint16), overwrite=True)
+    with pytest.raises(InputError, match=r"raw\.tif"):
+        figures_of(path, raw)
+    path = tmp_path / "weights.h5"
+    run("build-weights", config, "-o", path)
+    figures = figures_of(path)
+    assert list(figures) == ["column", "light"]
+    title = figures["column"].draw().get_suptitle()
+    assert title.startswith("voxel 2, 2, 1 at (0, 0.05, 0) mm")
+    light = figures["light"].draw().axes[0].lines
+    assert [line.get_label() for line in light] == ["middle", "half-way out", "corner"]
+    np.testing.assert_allclose(light[0].get_xdata(), [-0.4, 0.0, 0.4], atol=1e-12)
+    np.testing.assert_allclose(light[0].get_ydata(), 1.0, atol=0.01)

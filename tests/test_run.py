@@ -1,7 +1,5 @@
 """`run`: the whole chain at once, gone on with, and what it refuses."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path
@@ -12,7 +10,6 @@ import numpy as np
 import pytest
 import tifffile
 
-from lfpiv_cli.cli.main import cli
 from lfpiv_cli.console import Console
 from lfpiv_cli.errors import ConfigError, InputError, LfpivError, OutputExistsError, PartialError, UsageError
 from lfpiv_cli.files.provenance import carried_record, differences
@@ -21,18 +18,14 @@ from lfpiv_cli.verbs import report as report_stage
 from lfpiv_cli.verbs import run as stage
 from lfpiv_cli.verbs.report import report
 from lfpiv_cli.verbs.run_steps import RunOptions
+from tests.commands import SAMPLE, sample_rig
+from tests.commands import run as lfpiv
 
-ROOT = Path(__file__).parent.parent
-SAMPLE = ROOT / "sample_data"
 PAIR = SAMPLE / "pair_a.tif", SAMPLE / "pair_b.tif"
 PHOTOGRAPHS = [word for name in ("white", "dark", "board") for word in (f"--{name}", SAMPLE / f"{name}.tif")]
 RIGHT = "0.57 tracers for each microlens, and particles err less up to about 2"
 FILES = ("calibration.h5", "calibration.png", "weights.h5", "volumes/pair_a.vtkhdf", "volumes/pair_b.vtkhdf")
 VECTORS = "vectors.vtkhdf"
-
-
-def lfpiv(*arguments: object) -> None:
-    cli.main([str(argument) for argument in arguments], standalone_mode=False)
 
 
 def run(rig: Path, output: Path, *options: object, images: tuple[Path, ...] = PAIR) -> None:
@@ -41,12 +34,12 @@ def run(rig: Path, output: Path, *options: object, images: tuple[Path, ...] = PA
 
 def rig_in(folder: Path, *changes: tuple[str, str]) -> Path:
     """Write the sample's rig, its volumes by two iterations."""
-    text = (ROOT / "configs" / "sample.yaml").read_text()
-    for old, new in (("iterations: 16", "iterations: 2"), *changes):
-        assert old in text, old
-        text = text.replace(old, new)
-    (folder / "rig.yaml").write_text(text)
-    return folder / "rig.yaml"
+    return sample_rig(folder, ("iterations: 16", "iterations: 2"), *changes)
+
+
+def told_by(folder: Path) -> dict[str, Any]:
+    """Return what a run has written of itself."""
+    return dict(json.loads((folder / "out" / "run.json").read_text(), parse_constant=pytest.fail))
 
 
 @pytest.fixture(scope="module")
@@ -65,8 +58,7 @@ def again(ran: Path, tmp_path: Path) -> Path:
 
 
 def states(folder: Path) -> dict[str, str]:
-    told = json.loads((folder / "out" / "run.json").read_text())
-    return {name: step["state"] for name, step in told["steps"].items()}
+    return {name: step["state"] for name, step in told_by(folder)["steps"].items()}
 
 
 def stamps(folder: Path) -> dict[str, int]:
@@ -74,7 +66,7 @@ def stamps(folder: Path) -> dict[str, int]:
 
 
 @pytest.mark.thorough
-def test_files_are_those_of_the_single_commands(ran: Path, tmp_path: Path) -> None:
+def test_files_are_those_of_the_single_commands_and_it_says_what_was_chosen(ran: Path, tmp_path: Path) -> None:
     rig, calibration, weights = ran / "rig.yaml", tmp_path / "calibration.h5", tmp_path / "weights.h5"
     picture = ("--picture", tmp_path / "calibration.png")
     lfpiv("calibrate-snapshot", rig, *PHOTOGRAPHS, "-o", calibration, *picture, "-q")
@@ -83,28 +75,31 @@ def test_files_are_those_of_the_single_commands(ran: Path, tmp_path: Path) -> No
     lfpiv("correlate", *(tmp_path / name for name in FILES[3:]), "-o", tmp_path / VECTORS, "-q")
     for name in (*FILES, VECTORS):
         assert (tmp_path / name).read_bytes() == (ran / "out" / name).read_bytes(), name
-
-
-@pytest.mark.thorough
-def test_it_says_what_was_chosen_and_what_came_of_it(ran: Path) -> None:
-    told = json.loads((ran / "out" / "run.json").read_text(), parse_constant=pytest.fail)
+    told = told_by(ran)
     assert (told["method"], told["reason"]) == ("volumes", f"as asked for; but there are {RIGHT}")
     # 400 tracers before 660 microlenses.
     assert told["tracers_per_lens"] == pytest.approx(0.61, rel=0.2)
     assert list(told["summaries"]) == ["calibrate-snapshot", "build-weights", "reconstruct", "correlate"]
     assert told["figures"]["vectors"] == {"volumes": 90}
     assert told["figures"]["u_from_voxel"]["volumes"] < told["figures"]["u_to_voxel"]["volumes"]
+    (tmp_path / "run.json").write_text("mine")
+    with pytest.raises(OutputExistsError, match=r"run.json"):
+        run(ran / "rig.yaml", tmp_path)
 
 
 @pytest.mark.thorough
-def test_what_is_done_is_kept_with_its_summary(again: Path) -> None:
-    before, earlier = stamps(again), json.loads((again / "out" / "run.json").read_text())
+def test_what_is_done_is_kept_with_its_summary_and_what_is_lost_is_made_again(again: Path) -> None:
+    before, earlier = stamps(again), told_by(again)
     run(again / "rig.yaml", again / "out")
     assert stamps(again) == before
     assert set(states(again).values()) == {"kept"}
-    told = json.loads((again / "out" / "run.json").read_text())
+    told = told_by(again)
     assert told["summaries"] == earlier["summaries"]
     assert told["warnings"] == earlier["warnings"]
+    (again / "out" / "calibration.png").unlink()
+    run(again / "rig.yaml", again / "out")
+    assert (again / "out" / "calibration.png").exists()
+    assert states(again)["build-weights"] == "kept"
 
 
 @pytest.mark.thorough
@@ -121,12 +116,12 @@ def test_only_what_depends_on_a_change_is_made_anew(again: Path) -> None:
 
 
 @pytest.mark.thorough
-def test_settings_of_a_later_step_leave_what_was_made_before(again: Path, capsys) -> None:
+def test_settings_of_a_later_step_leave_what_was_made_before(again: Path, capsys: pytest.CaptureFixture[str]) -> None:
     names = [name for name in FILES if name.endswith(("h5", "vtkhdf"))]
     text = (again / "rig.yaml").read_text()
     (again / "rig.yaml").write_text(text.replace("windows: [24, 12]", "windows: [24, 10]"))
     before = {name: data_of(again / "out" / name) for name in names}
-    earlier = json.loads((again / "out" / "run.json").read_text())["summaries"]
+    earlier = told_by(again)["summaries"]
     with pytest.raises(OutputExistsError) as caught:
         run(again / "rig.yaml", again / "out")
     told = str(caught.value)
@@ -135,11 +130,18 @@ def test_settings_of_a_later_step_leave_what_was_made_before(again: Path, capsys
         "--overwrite keeps it, as it depends on none of that; with it the run makes vectors again and keeps "
         "calibration.h5, weights.h5 and volumes"
     )
-    assert planned(again, capsys)["to_make"] == {"volumes": 0, "vectors": 1}
+    capsys.readouterr()
+    run(again / "rig.yaml", again / "out", "--overwrite", "--dry-run", "--json")
+    assert json.loads(capsys.readouterr().out)["to_make"] == {"volumes": 0, "vectors": 1}
+    # Nor are volumes of other settings taken for those of a result.
+    shutil.copytree(again / "out", again / "results")
+    run(again / "rig.yaml", again / "results", "--keep", "results", "--overwrite")
+    made = json.loads((again / "results" / "run.json").read_text())
+    assert made["steps"]["correlate"]["state"] == "made"
     run(again / "rig.yaml", again / "out", "--overwrite")
     assert list(states(again).values()) == ["recorded anew"] * 3 + ["made"]
     assert {name: data_of(again / "out" / name) for name in names} == before
-    told = json.loads((again / "out" / "run.json").read_text())
+    told = told_by(again)
     assert told["summaries"]["reconstruct"] == earlier["reconstruct"]
     # What each carries is what a run from the beginning would have written, and it is kept from now on.
     carried = carried_record(again / "out" / "vectors.vtkhdf")
@@ -166,59 +168,30 @@ def test_what_a_change_makes_again_is_said_before(again: Path, change: tuple[str
 
 
 def test_what_has_changed_since_a_result_was_made_is_named() -> None:
-    config: dict[str, Any] = {"name": "rig.yaml", "sha256": "1"}
-    image = {"name": "a.tif", "sha256": "2"}
-    carried = {
-        "program": "lfpiv",
-        "version": "1",
-        "libraries": {"numpy": "2"},
-        "command": "reconstruct page 0",
-        "config": {"media": {"fluid": 1.33}, "window": None},
-        "inputs": {"config": config, "image": image},
-        "made_from": {},
-    }
-    changes: list[tuple[dict[str, Any], str]] = [
-        ({"config": {"media": {"fluid": 1.4}, "window": None}}, "media.fluid was 1.33, is 1.4"),
-        ({"config": {"media": {"fluid": 1.33}, "window": 2.0}}, "window was not given, is 2.0"),
-        ({"config": {"media": {"fluid": list(range(60))}, "window": None}}, "media.fluid has changed"),
-        ({"inputs": {"config": config, "image": {"name": "b.tif", "sha256": "3"}}}, "image is another file"),
-        (
-            {"inputs": {"config": {"name": "rig.yaml", "sha256": "4"}, "image": image}},
-            "the config is another file, which",
-        ),
-        ({"libraries": {"numpy": "3"}}, "numpy was 2, is 3"),
-        ({"version": "2"}, "lfpiv was 1, is 2"),
-        ({"command": "reconstruct page 1"}, "the command was reconstruct page 0, is reconstruct page 1"),
-    ]
+    config, image = {"name": "rig.yaml", "sha256": "1"}, {"name": "a.tif", "sha256": "2"}
+    carried = {"program": "lfpiv", "version": "1", "libraries": {"numpy": "2"}, "command": "reconstruct page 0"}
+    carried |= {"config": {"media": {"fluid": 1.33}, "window": None}, "made_from": {}}
+    carried |= {"inputs": {"config": config, "image": image}}
     assert differences(carried, carried) == []
-    for change, words in changes:
-        (told,) = differences(carried, carried | change)
+    for key, value, words in (
+        ("config", {"media": {"fluid": 1.4}, "window": None}, "media.fluid was 1.33, is 1.4"),
+        ("config", {"media": {"fluid": 1.33}, "window": 2.0}, "window was not given, is 2.0"),
+        ("config", {"media": {"fluid": list(range(60))}, "window": None}, "media.fluid has changed"),
+        ("inputs", {"config": config, "image": {"name": "b.tif", "sha256": "3"}}, "image is another file"),
+        ("inputs", {"config": config | {"sha256": "4"}, "image": image}, "the config is another file, which"),
+        ("libraries", {"numpy": "3"}, "numpy was 2, is 3"),
+        ("version", "2", "lfpiv was 1, is 2"),
+        ("command", "reconstruct page 1", "the command was reconstruct page 0, is reconstruct page 1"),
+    ):
+        (told,) = differences(carried, carried | {key: value})
         assert told.startswith(words)
-
-
-@pytest.mark.thorough
-def test_volumes_of_other_settings_are_not_taken_for_those_of_a_result(again: Path) -> None:
-    text = (again / "rig.yaml").read_text()
-    (again / "rig.yaml").write_text(text.replace("windows: [24, 12]", "windows: [24, 10]"))
-    run(again / "rig.yaml", again / "out", "--keep", "results", "--overwrite")
-    assert states(again)["correlate"] == "made"
-
-
-def planned(folder: Path, capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
-    """Return what a run that may overwrite says that it would do."""
-    capsys.readouterr()
-    run(folder / "rig.yaml", folder / "out", "--overwrite", "--dry-run", "--json")
-    told: dict[str, Any] = json.loads(capsys.readouterr().out)
-    return told
 
 
 def data_of(path: Path) -> dict[str, bytes]:
     """Return the bytes of all datasets in a file."""
     found: dict[str, bytes] = {}
     with h5py.File(path) as file:
-        file.visititems(
-            lambda name, item: found.update({name: item[()].tobytes()}) if isinstance(item, h5py.Dataset) else None
-        )
+        file.visititems(lambda name, h5: found.update({name: h5[()].tobytes()} if isinstance(h5, h5py.Dataset) else {}))
     return found
 
 
@@ -226,12 +199,12 @@ def data_of(path: Path) -> dict[str, bytes]:
 def test_a_torn_file_is_refused_or_made_again(again: Path) -> None:
     torn, whole = again / "out" / "weights.h5", (again / "out" / "weights.h5").read_bytes()
     torn.write_bytes(whole[:-1000])
-    told = json.loads((again / "out" / "run.json").read_text())["summaries"]
+    told = told_by(again)["summaries"]
     with pytest.raises(OutputExistsError, match="step 2, build-weights"):
         run(again / "rig.yaml", again / "out")
     run(again / "rig.yaml", again / "out", "--overwrite")
     assert torn.read_bytes() == whole
-    assert json.loads((again / "out" / "run.json").read_text())["summaries"] == told
+    assert told_by(again)["summaries"] == told
     assert [name for name, state in states(again).items() if state == "made"] == ["build-weights"]
 
 
@@ -247,15 +220,7 @@ def test_a_step_that_fails_leaves_those_before_it(again: Path) -> None:
 
 
 @pytest.mark.thorough
-def test_a_lost_picture_is_drawn_again(again: Path) -> None:
-    (again / "out" / "calibration.png").unlink()
-    run(again / "rig.yaml", again / "out")
-    assert (again / "out" / "calibration.png").exists()
-    assert states(again)["build-weights"] == "kept"
-
-
-@pytest.mark.thorough
-def test_the_report_is_made_of_what_was_made(again: Path, monkeypatch) -> None:
+def test_the_report_is_made_of_what_was_made(again: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     made = []
 
     def report(folder: Path, page: Path, options: Any, **_: Any) -> dict[str, Any]:
@@ -267,12 +232,14 @@ def test_the_report_is_made_of_what_was_made(again: Path, monkeypatch) -> None:
     for _ in range(2):
         run(again / "rig.yaml", again / "out", "--report")
     assert made == [(again / "out", {"pair_a.tif", "pair_b.tif", "white.tif", "board.tif"})]
-    told = json.loads((again / "out" / "run.json").read_text())
+    told = told_by(again)
     assert told["summaries"]["report"] == {"verdict": {"vectors": "good"}}
 
 
 @pytest.mark.thorough
-def test_results_are_kept_without_their_volumes_and_whatever_fails(again: Path, monkeypatch) -> None:
+def test_results_are_kept_without_their_volumes_and_whatever_fails(
+    again: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     images = again / "images"
     images.mkdir()
     for name, source in (("pair_a", 0), ("pair_b", 1), ("next_a", 0), ("next_b", 1), ("lost_a", 0)):
@@ -306,7 +273,7 @@ def test_results_are_kept_without_their_volumes_and_whatever_fails(again: Path, 
 
 
 @pytest.mark.thorough
-def test_the_verdict_is_the_same_whether_volumes_are_kept_or_not(again: Path, monkeypatch) -> None:
+def test_the_verdict_is_the_same_whether_volumes_are_kept_or_not(again: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(report_stage, "figures_of", lambda *_given: {})
     rig, out, images = again / "rig.yaml", again / "out", (again / "a.tif", again / "b.tif")
     for path, source in zip(images, PAIR, strict=True):
@@ -324,13 +291,6 @@ def test_the_verdict_is_the_same_whether_volumes_are_kept_or_not(again: Path, mo
     assert told[0][1] > 0
 
 
-@pytest.mark.thorough
-def test_what_is_not_of_a_run_is_not_replaced(ran: Path, tmp_path: Path) -> None:
-    (tmp_path / "run.json").write_text("mine")
-    with pytest.raises(OutputExistsError, match=r"run.json"):
-        run(ran / "rig.yaml", tmp_path)
-
-
 @pytest.mark.parametrize(
     ("options", "error", "said"),
     [
@@ -343,11 +303,7 @@ def test_what_is_not_of_a_run_is_not_replaced(ran: Path, tmp_path: Path) -> None
         ({"follow": True, "method": "volumes"}, UsageError, "--follow"),
         ({"follow": True, "method": "both", "combine": True}, UsageError, "--follow"),
         ({"change": (", dt_s: 0.002", "")}, ConfigError, "correlation.dt_s"),
-        (
-            {"change": (", dt_s: 0.002", ""), "images": (*PAIR, Path("missing.tif")), "keep_going": True},
-            ConfigError,
-            "correlation.dt_s",
-        ),
+        ({"change": (", dt_s: 0.002", ""), "images": (*PAIR, Path("no.tif")), "keep_going": True}, ConfigError, "dt_s"),
         ({"change": ("solver: em", "solver: particles"), "method": "both"}, ConfigError, "solver"),
         ({"change": ("correlation:", "weights: {method: dlfc}\ncorrelation:"), "method": "both"}, ConfigError, "dlfc"),
         ({"change": ("columns: 600", "columns: 599")}, InputError, "pair_a"),

@@ -1,7 +1,5 @@
 """`run` over pairs in parts: shards, a time limit, a dry run, several workers in one folder."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import threading
@@ -10,21 +8,14 @@ from typing import Any
 
 import pytest
 
-from lfpiv_cli.cli.main import cli
 from lfpiv_cli.errors import StoppedEarlyError, UsageError
 from lfpiv_cli.files import shares
 from lfpiv_cli.files.shares import Deadline
 from lfpiv_cli.verbs import run_steps
+from tests.commands import run as lfpiv
 from tests.test_run import PAIR, PHOTOGRAPHS, rig_in
 
-SMALL = (
-    ("shape_xyz: [30, 22, 40]", "shape_xyz: [12, 10, 14]"),
-    ("windows: [24, 12]", "windows: [8]"),
-)
-
-
-def lfpiv(*arguments: object) -> None:
-    cli.main([str(argument) for argument in arguments], standalone_mode=False)
+SMALL = (("shape_xyz: [30, 22, 40]", "shape_xyz: [12, 10, 14]"), ("windows: [24, 12]", "windows: [8]"))
 
 
 @pytest.fixture(scope="module")
@@ -33,11 +24,10 @@ def rig(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("rig")
     rig_in(folder, *SMALL)
     (folder / "images").mkdir()
+    (folder / "in_time").mkdir()
     for number in range(3):
         for letter, source in zip("ab", PAIR, strict=True):
             shutil.copyfile(source, folder / "images" / f"p{number}_{letter}.tif")
-    (folder / "in_time").mkdir()
-    for number in range(3):
         shutil.copyfile(PAIR[number % 2], folder / "in_time" / f"f{number}.tif")
     return folder
 
@@ -71,7 +61,7 @@ def with_weights(whole: Path, tmp_path: Path) -> Path:
 
 
 @pytest.mark.thorough
-def test_shards_together_give_what_one_command_gives(rig: Path, whole: Path, with_weights: Path) -> None:
+def test_shards_together_give_what_one_command_gives(rig, whole, with_weights):
     for number in (3, 1, 2):
         run(rig, with_weights, "--shard", f"{number}/3")
         assert not (with_weights / "run.json").exists()
@@ -91,35 +81,32 @@ def test_more_shards_than_pairs_and_without_volumes(rig: Path, whole: Path, with
 
 
 @pytest.mark.thorough
-def test_weights_that_another_shard_makes_are_waited_for(
+def test_weights_and_volumes_that_another_worker_makes_are_waited_for(
     rig: Path, whole: Path, with_weights: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    weights = with_weights / "weights.h5"
-    moved = weights.rename(with_weights.parent / "weights.h5")
     monkeypatch.setattr(shares, "SECONDS_BETWEEN_LOOKS", 0.05)
-    waiting = threading.Event()
-    made: list[bool] = []
-    build = run_steps.build_weights_file
-
-    def built(*arguments: Any, **options: Any) -> dict[str, Any]:
-        made.append(not weights.exists())
-        return build(*arguments, **options)
-
-    def other_shard() -> None:
-        waiting.wait(20.0)
-        shutil.copy2(moved, weights)
-        claim.__exit__(None, None, None)
-
-    monkeypatch.setattr(run_steps, "build_weights_file", built)
-    claim = shares.claimed(weights)
-    assert claim.__enter__()
-    sleep = shares.time.sleep
+    waiting, sleep = threading.Event(), shares.time.sleep
     monkeypatch.setattr(shares.time, "sleep", lambda seconds: (waiting.set(), sleep(seconds)))
-    other = threading.Thread(target=other_shard)
-    other.start()
-    run(rig, with_weights, "--shard", "1/3")
-    other.join()
-    assert made == [False]
+    weights, shared = with_weights / "weights.h5", with_weights / "volumes" / "f0.vtkhdf"
+    moved = weights.rename(with_weights.parent / "weights.h5")
+    shared.parent.mkdir()
+    for path, options in ((weights, ("--shard", "1/3")), (shared, ("--shard", "1/2", "--keep", "results"))):
+        waiting.clear()
+        other = shares.claimed(path)
+        assert other.__enter__()
+        images = "images" if path == weights else "in_time"
+        worker = threading.Thread(target=run, args=(rig, with_weights, *options), kwargs={"images": images})
+        worker.start()
+        while worker.is_alive() and not waiting.is_set():
+            waiting.wait(0.05)
+        assert waiting.is_set()
+        if path == weights:
+            shutil.copy2(moved, weights)
+        made = weights.stat().st_ino
+        other.__exit__(None, None, None)
+        worker.join()
+        assert weights.stat().st_ino == made
+    assert (with_weights / "vectors" / "f0.vtkhdf").exists()
 
 
 @pytest.mark.thorough
@@ -142,22 +129,27 @@ def test_it_stops_before_its_time_limit_and_goes_on(
 
 
 def planned(rig: Path, output: Path, capsys: pytest.CaptureFixture[str], *options: object) -> dict[str, Any]:
+    """Return what a run says that it would do."""
     capsys.readouterr()
     run(rig, output, "--dry-run", "--json", *options)
-    return json.loads(capsys.readouterr().out)
+    return dict(json.loads(capsys.readouterr().out))
 
 
-def test_a_dry_run_before_there_is_anything(rig: Path, tmp_path: Path, capsys) -> None:
+def test_a_dry_run_before_there_is_anything_and_a_sequence_is_not_divided(
+    rig: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     told = planned(rig, tmp_path / "out", capsys, "--shard", "1/3")
     assert not (tmp_path / "out").exists()
     assert told["steps_to_make"] == ["calibrate-snapshot", "build-weights"]
     assert (told["frames"], told["pairs"], told["to_make"]) == (2, 1, {"volumes": 2, "vectors": 1})
     assert 0.0 < told["disk_mb"] < 3.0
+    with pytest.raises(UsageError, match="a sequence is followed from frame to frame"):
+        lfpiv("run", rig / "rig.yaml", rig / "images", *PHOTOGRAPHS, "--follow", "--shard", "1/2", "-o", tmp_path)
 
 
 @pytest.mark.thorough
 def test_a_dry_run_tells_what_is_left_and_writes_nothing(
-    rig: Path, whole: Path, with_weights: Path, tmp_path: Path, capsys
+    rig: Path, whole: Path, with_weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     log = ("--log", tmp_path / "log")
     run(rig, with_weights, "--shard", "1/3", *log)
@@ -175,18 +167,13 @@ def test_a_dry_run_tells_what_is_left_and_writes_nothing(
 
 
 @pytest.mark.thorough
-def test_a_dry_run_without_volumes(rig: Path, with_weights: Path, capsys) -> None:
+def test_a_dry_run_without_volumes(rig: Path, with_weights: Path, capsys: pytest.CaptureFixture[str]) -> None:
     keep = ("--keep", "results")
     assert planned(rig, with_weights, capsys, *keep)["to_make"] == {"vectors": 3}
     run(rig, with_weights, "--shard", "2/3", *keep)
     told = planned(rig, with_weights, capsys, *keep)
     assert (told["to_make"], told["skipped"]) == ({"vectors": 2}, {"vectors": 1})
     assert not any((with_weights / "volumes").iterdir())
-
-
-def test_a_sequence_is_not_divided(rig: Path, tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="a sequence is followed from frame to frame"):
-        lfpiv("run", rig / "rig.yaml", rig / "images", *PHOTOGRAPHS, "--follow", "--shard", "1/2", "-o", tmp_path)
 
 
 @pytest.mark.thorough
@@ -208,30 +195,6 @@ def test_volumes_that_another_worker_needs_stay(rig: Path, with_weights: Path) -
     assert inode == [before]
     assert sorted(path.name for path in (with_weights / "vectors").iterdir()) == ["f0.vtkhdf", "f1.vtkhdf"]
     assert not (with_weights / "volumes").exists()
-
-
-@pytest.mark.thorough
-def test_a_volume_that_another_worker_makes_is_waited_for(
-    rig: Path, with_weights: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(shares, "SECONDS_BETWEEN_LOOKS", 0.05)
-    waiting, sleep = threading.Event(), shares.time.sleep
-    monkeypatch.setattr(shares.time, "sleep", lambda seconds: (waiting.set(), sleep(seconds)))
-    (with_weights / "volumes").mkdir()
-    other = shares.claimed(with_weights / "volumes" / "f0.vtkhdf")
-    assert other.__enter__()
-    worker = threading.Thread(
-        target=run,
-        args=(rig, with_weights, "--shard", "1/2", "--keep", "results"),
-        kwargs={"images": "in_time"},
-    )
-    worker.start()
-    while worker.is_alive() and not waiting.is_set():
-        waiting.wait(0.05)
-    assert waiting.is_set()
-    other.__exit__(None, None, None)
-    worker.join()
-    assert (with_weights / "vectors" / "f0.vtkhdf").exists()
 
 
 @pytest.mark.thorough

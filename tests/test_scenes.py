@@ -1,7 +1,5 @@
 """Simulated scenes: what the truth says is what the images show."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -39,7 +37,19 @@ def small(camera):
     return replace(camera, columns=150, rows=120)
 
 
-def test_misalignment_turns_then_shifts(camera):
+def test_boxes_and_windows_of_a_channel(table2, water, camera):
+    volume = Grid.centred((130, 100, 100), (0.1, 0.1, 0.1), (0.0, 0.0, -0.5))
+    box = Box.around(volume, (0.5, 0.5, 0.5)).within(channel_walls(10.0, -0.4655))
+    assert box.low_mm == pytest.approx((-7.0, -5.0, -5.4655))
+    assert box.high_mm == pytest.approx((7.0, 5.0, 4.5345))
+    along_y = channel_walls(10.0, 0.0, "y")
+    assert (along_y.low_mm, along_y.high_mm) == ((-5.0, -np.inf, -5.0), (5.0, np.inf, 5.0))
+    with pytest.raises(ConfigError, match="no part in common"):
+        Box((0, 0, 8), (1, 1, 9)).within(channel_walls(10.0, 0.0))
+    window = channel_window(table2.focus_distance_mm, water, 10.0, 5.0, -0.4655)
+    assert fluid_path_to_focus(window, table2.focus_distance_mm, water) - 0.4655 == pytest.approx(5.0)
+    # by hand: 200 - 5/1.49 - 5.4655/1.33 = 200 - 3.355705 - 4.109398
+    assert window.distance_mm == pytest.approx(192.534897, abs=1e-6)
     found = Misalignment(0.12, (3.4, -2.1), 2e-5).apply(camera)
     # the lens on the axis goes to 3.4 px and -2.1 px of 0.0055 mm
     assert found.lattice.origin == pytest.approx([0.0187, -0.01155])
@@ -47,36 +57,12 @@ def test_misalignment_turns_then_shifts(camera):
     assert found.distortion_per_mm2 == 2e-5
 
 
-def test_a_box_around_a_volume_in_a_channel():
-    volume = Grid.centred((130, 100, 100), (0.1, 0.1, 0.1), (0.0, 0.0, -0.5))
-    box = Box.around(volume, (0.5, 0.5, 0.5)).within(channel_walls(10.0, -0.4655))
-    assert box.low_mm == pytest.approx((-7.0, -5.0, -5.4655))
-    assert box.high_mm == pytest.approx((7.0, 5.0, 4.5345))
-    along_y = channel_walls(10.0, 0.0, "y")
-    assert (along_y.low_mm, along_y.high_mm) == ((-5.0, -np.inf, -5.0), (5.0, np.inf, 5.0))
-
-
-def test_boxes_apart_are_refused():
-    with pytest.raises(ConfigError, match="no part in common"):
-        Box((0, 0, 8), (1, 1, 9)).within(channel_walls(10.0, 0.0))
-
-
-def test_channel_window_is_half_the_width_in_front_of_the_mid_plane(table2, water):
-    window = channel_window(table2.focus_distance_mm, water, 10.0, 5.0, -0.4655)
-    assert fluid_path_to_focus(window, table2.focus_distance_mm, water) - 0.4655 == pytest.approx(5.0)
-    # by hand: 200 - 5/1.49 - 5.4655/1.33 = 200 - 3.355705 - 4.109398
-    assert window.distance_mm == pytest.approx(192.534897, abs=1e-6)
-
-
-def test_white_image_has_light_dark_and_truth(small, rng):
+def test_white_image_and_board_have_light_dark_and_truth(small, rng):
     camera = Misalignment(0.3, (2.0, -1.0)).apply(small)
     still = simulate_white(RecordingCamera(camera, NOISELESS), 1000.0, rng)
     assert (still.image.max(), still.dark.min(), still.dark.max()) == (1096, 96, 96)
     assert still.truth["rotation_deg"] == pytest.approx(0.3)
     assert still.truth["pitch_px"] == pytest.approx([18.2545, 18.2545], abs=1e-4)
-
-
-def test_board_s_truth_is_its_placement(small, rng):
     board = BoardGeometry((1, 1), 1.0, 0.2)
     still = simulate_board(
         RecordingCamera(small, NOISELESS), AIR, board, BoardPlacement(-0.35, (0.1, 0.05)), 1000.0, rng
@@ -152,17 +138,7 @@ def test_tracers_of_a_long_sequence_stay_on_their_paths(frames, rng):
         assert place == pytest.approx(expected, abs=2e-4)
 
 
-def test_tracers_come_into_the_light_and_leave_it(small):
-    tracers = Tracers(40, Box((-0.2, -0.2, -3.0), (0.2, 0.2, 3.0)), light_counts=1.0, rays=1, light_z_mm=(-1.0, 1.0))
-    motion = Motion(uniform((0.0, 0.0, 0.5)), 2e-3, 3)
-    found = simulate_particles(RecordingCamera(small, NOISELESS), AIR, tracers, motion, np.random.default_rng(4))
-    start = found.positions_mm[:, 2]
-    for shown, moved in zip(found.frame_brightness, (-1.0, 0.0, 1.0), strict=True):
-        assert np.array_equal(shown > 0.0, np.abs(start + moved) < 1.0)
-    assert np.array_equal(found.brightness, found.frame_brightness[1])
-
-
-def test_sizes_and_flicker_have_their_spread(rng):
+def test_sizes_flicker_and_brightness_have_their_spread(rng):
     tracers = Tracers(4000, Box((0, 0, 0), (1, 1, 1)), diameter_log_sigma=0.3, brightness_flicker=0.2)
     logarithm, flicker = np.log(tracers.draw_sizes(rng)), tracers.draw_flicker(3, rng)
     # standard errors of 4000 and 12000: 0.005 and 0.0034, 0.002 and 0.0014
@@ -170,24 +146,16 @@ def test_sizes_and_flicker_have_their_spread(rng):
     assert (flicker.mean(), flicker.std()) == (pytest.approx(1.0, abs=0.008), pytest.approx(0.2, abs=0.008))
     # each frame has its own
     assert abs(np.corrcoef(flicker)[0, 1]) < 0.06
-
-
-def test_light_goes_with_the_square_of_the_diameter(small, rng):
-    tracers = Tracers(9, Box((0, 0, 0), (0.1, 0.1, 1)), 0.1, brightness=(2.0, 2.0), rays=1, diameter_log_sigma=0.5)
-    motion = Motion(uniform((0, 0, 0)), 1e-3)
-    found = simulate_particles(RecordingCamera(small, NOISELESS), AIR, tracers, motion, rng)
-    assert found.diameters_mm.max() > 1.5 * found.diameters_mm.min()
-    assert found.frame_brightness == pytest.approx(np.tile(2.0 * (found.diameters_mm / 0.1) ** 2, (2, 1)))
-
-
-def test_tracers_alike_draw_no_numbers_for_their_sizes_and_flicker(rng):
+    brightness = Tracers(4000, Box((0.0, 0.0, 0.0), (1.0, 1.0, 1.0)), brightness_log_sigma=0.5).draw_brightness(rng)
+    assert np.mean(np.log(brightness)) == pytest.approx(0.0, abs=0.03)  # 0.5/sqrt(4000) is 0.008
+    assert np.std(np.log(brightness)) == pytest.approx(0.5, abs=0.02)
     before, tracers = rng.bit_generator.state, Tracers(3, Box((0, 0, 0), (1, 1, 1)))
     assert np.array_equal(tracers.draw_sizes(rng), np.ones(3))
     assert np.array_equal(tracers.draw_flicker(2, rng), np.ones((2, 3)))
     assert rng.bit_generator.state == before
 
 
-def test_tracers_fill_the_box_and_the_brightness(small, rng):
+def test_tracers_fill_the_box_and_come_into_the_light_and_leave_it(small, rng):
     box = Box((-1.0, -2.0, -3.0), (1.0, 2.0, 4.0))
     tracers = Tracers(2000, box, light_counts=100.0, rays=1)
     pair = simulate_particles(
@@ -200,34 +168,40 @@ def test_tracers_fill_the_box_and_the_brightness(small, rng):
         pytest.approx(0.6, abs=0.01),
         pytest.approx(1.4, abs=0.01),
     )
+    tracers = Tracers(9, Box((0, 0, 0), (0.1, 0.1, 1)), 0.1, brightness=(2.0, 2.0), rays=1, diameter_log_sigma=0.5)
+    motion = Motion(uniform((0, 0, 0)), 1e-3)
+    found = simulate_particles(RecordingCamera(small, NOISELESS), AIR, tracers, motion, rng)
+    assert found.diameters_mm.max() > 1.5 * found.diameters_mm.min()
+    assert found.frame_brightness == pytest.approx(np.tile(2.0 * (found.diameters_mm / 0.1) ** 2, (2, 1)))
+    tracers = Tracers(40, Box((-0.2, -0.2, -3.0), (0.2, 0.2, 3.0)), light_counts=1.0, rays=1, light_z_mm=(-1.0, 1.0))
+    motion = Motion(uniform((0.0, 0.0, 0.5)), 2e-3, 3)
+    found = simulate_particles(RecordingCamera(small, NOISELESS), AIR, tracers, motion, np.random.default_rng(4))
+    start = found.positions_mm[:, 2]
+    for shown, moved in zip(found.frame_brightness, (-1.0, 0.0, 1.0), strict=True):
+        assert np.array_equal(shown > 0.0, np.abs(start + moved) < 1.0)
+    assert np.array_equal(found.brightness, found.frame_brightness[1])
 
 
-def test_tracers_fill_a_pipe_and_nothing_else(rng):
-    pipe = RoundWall(2.0, (0.0, 0.5, -0.4), "x")
-    box = Box((-1.0, -9.0, -9.0), (1.0, 9.0, 9.0)).within(pipe_bounds(pipe))
-    places = Tracers(4000, box, walls=pipe).draw_places(rng)
-    assert places.shape == (4000, 3)
-    share = (pipe.distances_mm(places) / 2.0) ** 2
-    assert share.max() <= 1.0
-    # evenly spread over the section, squares of the distance are evenly spread: 1000 with a spread of 27
-    assert np.histogram(share, 4, (0.0, 1.0))[0] == pytest.approx([1000] * 4, abs=120)
-    assert box.volume_mm3(pipe) == pytest.approx(box.volume_mm3() * np.pi / 4)
-
-
-def test_tracers_fill_a_tilted_pipe(rng):
-    pipe = RoundWall(2.0, (0.0, 0.5, -0.4), (1.0, 0.05, 0.0))
-    box = Box((-4.0, -9.0, -9.0), (4.0, 9.0, 9.0)).within(pipe_bounds(pipe))
-    places = Tracers(4000, box, walls=pipe).draw_places(rng)
-    share = (pipe.distances_mm(places) / 2.0) ** 2
-    assert np.histogram(share, 4, (0.0, 1.0))[0] == pytest.approx([1000] * 4, abs=120)
-    # at the ends of the box the pipe is 0.2 mm beside its middle: nothing of it is cut off
+def test_tracers_fill_a_pipe_and_go_round_in_circles(rng):
+    for axis, half_mm in (("x", 1.0), ((1.0, 0.05, 0.0), 4.0)):
+        pipe = RoundWall(2.0, (0.0, 0.5, -0.4), axis)
+        box = Box((-half_mm, -9.0, -9.0), (half_mm, 9.0, 9.0)).within(pipe_bounds(pipe))
+        places = Tracers(4000, box, walls=pipe).draw_places(rng)
+        assert places.shape == (4000, 3)
+        share = (pipe.distances_mm(places) / 2.0) ** 2
+        assert share.max() <= 1.0
+        # evenly spread over the section, squares of the distance are evenly spread: 1000 with a spread of 27
+        assert np.histogram(share, 4, (0.0, 1.0))[0] == pytest.approx([1000] * 4, abs=120)
+        if axis == "x":
+            assert box.volume_mm3(pipe) == pytest.approx(box.volume_mm3() * np.pi / 4)
+    # at the ends of the box the tilted pipe is 0.2 mm beside its middle: nothing of it is cut off
     assert places[places[:, 0] > 3.0, 1].max() > 0.5 + 2.0 + 0.1
-
-
-def test_brightness_can_be_log_normal(rng):
-    brightness = Tracers(4000, Box((0.0, 0.0, 0.0), (1.0, 1.0, 1.0)), brightness_log_sigma=0.5).draw_brightness(rng)
-    assert np.mean(np.log(brightness)) == pytest.approx(0.0, abs=0.03)  # 0.5/sqrt(4000) is 0.008
-    assert np.std(np.log(brightness)) == pytest.approx(0.5, abs=0.02)
+    # Their velocity turns along the path: 0.3 rad from frame to frame, against the rotation itself.
+    omega, start = np.array([0.0, 180.0, 240.0]), rng.uniform(-3.0, 3.0, (10, 3))
+    motion = Motion(rigid_rotation(omega), 1e-3, 7)
+    for place, time_s in zip(motion.places_mm(start), motion.times_s(), strict=True):
+        # four steps of 0.075 rad a frame, (0.075)^5/120 of 5 mm each: 1e-6 mm over three frames
+        assert place == pytest.approx(Rotation.from_rotvec(omega * time_s).apply(start), abs=2e-6)
 
 
 def test_a_pair_is_decided_by_its_seed(small):
@@ -243,12 +217,3 @@ def test_a_pair_is_decided_by_its_seed(small):
     ]
     assert np.array_equal(pairs[0].images[1], pairs[1].images[1])
     assert np.array_equal(pairs[0].positions_mm, pairs[1].positions_mm)
-
-
-def test_tracers_of_a_sequence_go_round_in_circles(rng):
-    """Their velocity turns along the path: 0.3 rad from frame to frame, against the rotation itself."""
-    omega, start = np.array([0.0, 180.0, 240.0]), rng.uniform(-3.0, 3.0, (10, 3))
-    motion = Motion(rigid_rotation(omega), 1e-3, 7)
-    for place, time_s in zip(motion.places_mm(start), motion.times_s(), strict=True):
-        # four steps of 0.075 rad a frame, (0.075)^5/120 of 5 mm each: 1e-6 mm over three frames
-        assert place == pytest.approx(Rotation.from_rotvec(omega * time_s).apply(start), abs=2e-6)

@@ -1,6 +1,4 @@
-"""Tracks over many frames: ghosts and losses whose answer is known, and what the velocities' errors promise."""
-
-from __future__ import annotations
+"""Tracks of pairs and over many frames: flows, ghosts and losses whose answer is known, and what errors promise."""
 
 from dataclasses import dataclass
 
@@ -8,18 +6,132 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from lfpiv_cli.files.particle_file import POSITION
 from lfpiv_cli.scale import Scale
-from lfpiv_cli.synthetic.flows import advect, rigid_rotation
+from lfpiv_cli.synthetic.flows import advect, rigid_rotation, taylor_green
 from lfpiv_cli.tracks.candidates import NO_TRACK, Seen, Trajectories
+from lfpiv_cli.tracks.gridding import on_grid
 from lfpiv_cli.tracks.in_time import Scatter, fit_in_time, scatter_of
 from lfpiv_cli.tracks.sequences import follow, scatter_in, states_at
 from lfpiv_cli.tracks.tracking import Forecast, track
+from lfpiv_cli.verbs.tracks import SequenceTracks
 
-BOX_MM, DT_S = 4.0, 0.002
-NOISE_MM = np.array([0.003, 0.003, 0.02])
-FRAMES = 6
 # Table 2's camera.
 SCALE = Scale(0.1, 1.064)
+NOISE_MM = np.array([0.003, 0.003, 0.02])
+BOX_MM, DT_S = 4.0, 0.002
+
+
+def moved(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return displacements of a sheared flow that is also turned: up to 0.5 mm, more than the particles' distance."""
+    x, y, z = (points - 2.0).T
+    return np.stack([0.3 + 0.05 * z, 0.04 * x, -0.1 + 0.03 * y], axis=1)
+
+
+@pytest.fixture
+def frames(rng: np.random.Generator) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Two frames of 500 particles in 64 mm3, a tenth of each frame alone in it; the first 450 belong together."""
+    both = rng.uniform(0.0, BOX_MM, (450, 3))
+    lone = rng.uniform(0.0, BOX_MM, (2, 50, 3))
+    noise = rng.normal(0.0, (0.003, 0.003, 0.02), (2, 450, 3))
+    return np.concatenate([both + noise[0], lone[0]]), np.concatenate([both + moved(both) + noise[1], lone[1]])
+
+
+def test_particles_are_followed_further_than_their_distance_and_few_without_common_ones(
+    frames: tuple[NDArray[np.float64], NDArray[np.float64]], rng: np.random.Generator
+) -> None:
+    tracks = track(*map(Seen, frames), 0.6, SCALE)
+    right = (tracks.first == tracks.second) & (tracks.first < 450)
+    assert right.sum() > 0.9 * 450
+    assert right.mean() > 0.98
+    assert np.unique(tracks.second).size == tracks.second.size
+    first, second = (Seen(points) for points in rng.uniform(0.0, BOX_MM, (2, 300, 3)))
+    assert len(track(first, second, 0.3, SCALE).first) < 60
+    assert track(Seen(np.zeros((0, 3))), Seen(np.zeros((3, 3))), 0.5, SCALE).first.size == 0
+    assert track(Seen(np.zeros((3, 3))), Seen(np.zeros((0, 3))), 0.5, SCALE).first.size == 0
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("count", [1, 2, 5, 12, 27])
+def test_few_particles_are_followed_among_ghosts(count: int, rng: np.random.Generator) -> None:
+    """A fifth as many ghosts, at least one, in each frame; forty pairs of frames for the few."""
+    ghosts, right, linked, pairs = -(-count // 5), 0, 0, 40
+    for _ in range(pairs):
+        both = rng.uniform(0.0, BOX_MM, (count, 3))
+        start, end = (each + rng.normal(0.0, NOISE_MM, each.shape) for each in (both, both + moved(both)))
+        alone = rng.uniform(0.0, BOX_MM, (2, ghosts, 3))
+        frames = np.concatenate([start, alone[0]]), np.concatenate([end, alone[1]])
+        links = track(*map(Seen, frames), 0.6, SCALE)
+        right += np.count_nonzero((links.first == links.second) & (links.first < count))
+        linked += len(links.first)
+    # A ghost has another within reach in one frame of forty for each particle there.
+    assert right > 0.9 * count * pairs
+    assert right > 0.93 * linked
+
+
+@pytest.mark.parametrize("factor", [10.0, 0.2])
+@pytest.mark.parametrize("count", [4, 20, 500])
+def test_a_world_of_another_size_has_the_same_links(
+    count: int, factor: float, frames: tuple[NDArray[np.float64], NDArray[np.float64]]
+) -> None:
+    some = slice(max(0, 448 - count), 452)
+    first, second = frames[0][some], frames[1][some]
+    here = track(Seen(first), Seen(second), 0.6, SCALE)
+    there = track(Seen(factor * first), Seen(factor * second), factor * 0.6, Scale(factor * 0.1, factor * 1.064))
+    np.testing.assert_array_equal(there.first, here.first)
+    np.testing.assert_array_equal(there.second, here.second)
+    np.testing.assert_allclose(there.probability, here.probability, atol=1e-9)
+
+
+def test_grid_takes_a_quadratic_flow_exactly_and_has_no_vector_without_tracks(rng: np.random.Generator) -> None:
+    points, nodes = rng.uniform(0.0, BOX_MM, (800, 3)), rng.uniform(0.5, 3.5, (20, 3))
+
+    def flow(at: NDArray[np.float64]) -> NDArray[np.float64]:
+        x, y, z = at.T
+        return np.stack([1.0 - x**2 + x * z, 0.3 * y + z**2, x * y - y * z], axis=1)
+
+    sigma = np.full(points.shape, 0.01)
+    value, error = on_grid(points, flow(points), sigma, np.concatenate([nodes, [[12.0] * 3]]), 1.0)
+    np.testing.assert_allclose(value[:-1], flow(nodes), atol=1e-9)
+    assert error[:-1].max() < 1e-9
+    assert np.isnan([value[-1], error[-1]]).all()
+
+
+def test_grid_states_its_error_and_ignores_strays(rng: np.random.Generator) -> None:
+    points = rng.uniform(0.0, BOX_MM, (1500, 3))
+    sigma = np.broadcast_to((0.002, 0.002, 0.02), points.shape)
+    values = moved(points) + rng.normal(0.0, sigma)
+    values[::25] += rng.uniform(-0.5, 0.5, values[::25].shape)
+    nodes = rng.uniform(0.5, 3.5, (200, 3))
+    value, error = on_grid(points, values, sigma, nodes, 1.0)
+    ratio = (value - moved(nodes)) / error
+    # A linear flow: nothing is missed, and what is stated for it is what chance makes of nothing. Neighbouring nodes
+    # share tracks, so 200 nodes make some 60 independent ones: 10 %.
+    assert np.all(np.sqrt(np.mean(ratio**2, axis=0)) < 1.2)
+    assert np.all(np.sqrt(np.mean(ratio**2, axis=0)) > 0.55)
+    # As well as the sixty tracks of the widest line, and not the ten unknowns of a parabola, let it.
+    assert np.all(np.median(np.abs(value - moved(nodes)), axis=0) < 0.25 * sigma[0])
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize(("wavelength_mm", "tracks"), [(4.0, 1500), (8.0, 300), (2.5, 1500)])
+def test_errors_are_stated_whatever_the_density_and_the_flow(
+    wavelength_mm: float, tracks: int, rng: np.random.Generator
+) -> None:
+    """Vortices seen by many tracks and by few: a component that is all noise, and two that bend."""
+    flow = taylor_green(0.1, wavelength_mm, (2.0, 2.0, 2.0), "xy")
+    points = rng.uniform(0.0, BOX_MM, (tracks, 3))
+    sigma = np.full(points.shape, 0.001)
+    nodes = np.stack(np.meshgrid(*[np.linspace(0.4, 3.6, 7)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    value, error = on_grid(points, 2.0 * flow(points) + rng.normal(0.0, sigma), sigma, nodes, 4.0)
+    covered = np.mean(np.abs(value - 2.0 * flow(nodes)) < 1.96 * error, axis=0)
+    # One fit for all, a parabola through 45, covers about .82 of x and y, and has nearly twice the noise in z.
+    assert np.all(covered > 0.88)
+    assert np.sqrt(np.mean(value[:, 2] ** 2)) < 0.5 * sigma[0, 2]
+
+
+FRAMES = 6
+# Table 2's camera.
 # Up to 0.26 mm a frame, where particles are 0.5 mm apart.
 FLOW = rigid_rotation((0.0, 20.0, 0.0), (2.0, 2.0, 2.0), (0.05, 0.0, 0.06))
 
@@ -45,6 +157,12 @@ class Recorded:
 def seen(points: NDArray[np.float64], noise_mm: NDArray[np.float64] = NOISE_MM) -> Seen:
     """Return places with the covariance of their noise."""
     return Seen(points, np.tile([*noise_mm**2, 0.0, 0.0, 0.0], (len(points), 1)))
+
+
+def lengths_of(tracks: Trajectories) -> NDArray[np.int64]:
+    """Return the length of each place's track, 0 where it is of none."""
+    labels = np.concatenate(tracks.labels)
+    return np.append(np.bincount(labels[labels != NO_TRACK]), 0)[labels]
 
 
 def record(rng: np.random.Generator, ghosts: float, noise: float) -> Recorded:
@@ -89,7 +207,9 @@ def error_over_sigma(recorded: Recorded, found: Trajectories, frames: int) -> ND
 
 
 @pytest.mark.thorough
-def test_errors_fall_with_the_number_of_frames_and_are_stated(recorded: Recorded, followed: Trajectories) -> None:
+def test_errors_fall_with_the_number_of_frames_and_tracks_go_on_over_lost_ones(
+    recorded: Recorded, followed: Trajectories
+) -> None:
     pair = track(*recorded.seen[:2], 0.4, SCALE)
     moved = recorded.points[1][pair.second] - recorded.points[0][pair.first]
     middle = 0.5 * (recorded.true_mm[0][pair.first] + recorded.true_mm[1][pair.second])
@@ -104,35 +224,6 @@ def test_errors_fall_with_the_number_of_frames_and_are_stated(recorded: Recorded
     # or at their middle; at the ends of bent ones (x) little is won.
     assert np.all(spread[1] < np.array([0.9, 0.65, 0.75]) * spread[0])
     assert np.all(spread[2] < 0.75 * spread[1])
-
-
-@pytest.mark.thorough
-def test_ghosts_fall_with_the_length_of_tracks() -> None:
-    """As many ghosts as particles, which are known so badly that a ghost is often where one is expected."""
-    crowd = record(np.random.default_rng(6), ghosts=1.0, noise=4.0)
-    pair = track(*crowd.seen[:2], 0.4, SCALE)
-    of_pair = np.mean((crowd.true_number[0][pair.first] < 0) | (crowd.true_number[1][pair.second] < 0))
-    found = crowd.follow(5, 2)
-    labels, truth = np.concatenate(found.labels), np.concatenate(crowd.true_number[:5])
-    length = np.append(np.bincount(labels[labels != NO_TRACK]), 0)[labels]
-    shares = [np.mean(truth[length >= shortest] < 0) for shortest in (3, 4, 5)]
-    assert of_pair > 0.05
-    assert shares[0] < of_pair
-    assert shares[1] < 0.5 * of_pair
-    assert shares[2] < 0.25 * of_pair
-
-
-@pytest.mark.thorough
-def test_short_tracks_hold_few_particles() -> None:
-    """As many ghosts as particles, known half as badly: nine of ten are there in each frame, and gaps are bridged."""
-    crowd = record(np.random.default_rng(6), ghosts=1.0, noise=2.0)
-    labels, truth = np.concatenate(crowd.follow(5, 2).labels), np.concatenate(crowd.true_number[:5])
-    length = np.append(np.bincount(labels[labels != NO_TRACK]), 0)[labels]
-    assert np.mean(length[truth >= 0] >= 3) > 0.85
-
-
-@pytest.mark.thorough
-def test_tracks_go_on_over_a_frame_that_has_lost_them(recorded: Recorded, followed: Trajectories) -> None:
     before, lost, after = recorded.true_number[2:5]
     gone = np.setdiff1d(np.intersect1d(before[before >= 0], after), lost)
     of_track = [dict(zip(n, t, strict=True)) for n, t in zip(recorded.true_number, followed.labels, strict=True)]
@@ -142,7 +233,24 @@ def test_tracks_go_on_over_a_frame_that_has_lost_them(recorded: Recorded, follow
     assert np.mean([of_track[2][p] == of_track[4][p] for p in begun]) > 0.85
 
 
-def test_tracks_are_of_one_particle_each(recorded: Recorded, followed: Trajectories) -> None:
+@pytest.mark.thorough
+def test_ghosts_fall_with_the_length_of_tracks() -> None:
+    """As many ghosts as particles, which are known so badly that a ghost is often where one is expected."""
+    crowd = record(np.random.default_rng(6), ghosts=1.0, noise=4.0)
+    pair = track(*crowd.seen[:2], 0.4, SCALE)
+    of_pair = np.mean((crowd.true_number[0][pair.first] < 0) | (crowd.true_number[1][pair.second] < 0))
+    length, truth = lengths_of(crowd.follow(5, 2)), np.concatenate(crowd.true_number[:5])
+    shares = [np.mean(truth[length >= shortest] < 0) for shortest in (3, 4, 5)]
+    assert of_pair > 0.05
+    assert np.all(np.array(shares) < of_pair * np.array([1.0, 0.5, 0.25]))
+    # Known half as badly, nine of ten are there in each frame, and gaps are bridged.
+    crowd = record(np.random.default_rng(6), ghosts=1.0, noise=2.0)
+    assert np.mean(lengths_of(crowd.follow(5, 2))[np.concatenate(crowd.true_number[:5]) >= 0] >= 3) > 0.85
+
+
+def test_tracks_are_of_one_particle_each_and_their_own_past_goes_first(
+    recorded: Recorded, followed: Trajectories, rng: np.random.Generator
+) -> None:
     labels, truth = np.concatenate(followed.labels), np.concatenate(recorded.true_number)
     order = np.argsort(labels, kind="stable")
     starts = np.searchsorted(labels[order], np.arange(followed.count))
@@ -151,24 +259,26 @@ def test_tracks_are_of_one_particle_each(recorded: Recorded, followed: Trajector
     # None has two places in a frame, and none fewer than were asked for.
     assert all(np.unique(each[each != NO_TRACK]).size == np.sum(each != NO_TRACK) for each in followed.labels)
     assert np.bincount(labels[labels != NO_TRACK]).min() >= 3
-
-
-def test_frames_of_nothing_give_no_tracks() -> None:
-    empty = [seen(np.zeros((0, 3)))] * 4
-    found = follow(empty, 0.4, 3, SCALE)
-    assert found.count == 0
-    assert states_at(found, empty, 1.5, *scatter_in(found, empty))[0].size == 0
+    # Each particle moves in its own way, as in a flow with vortices smaller than the particles' distance.
+    start = rng.uniform(0.0, BOX_MM, (400, 3))
+    moved = rng.normal(0.0, 0.25, start.shape)
+    noise = rng.normal(0.0, NOISE_MM, start.shape)
+    forecast = Forecast(moved + noise, np.broadcast_to(NOISE_MM, start.shape))
+    for prediction, least, most in ((forecast, 0.95, 1.0), (None, 0.0, 0.5)):
+        links = track(Seen(start), Seen(start + moved), 0.8, SCALE, prediction)
+        assert least * 400 <= np.sum(links.first == links.second) <= most * 400
 
 
 @pytest.mark.parametrize("frames", [3, 7])
-def test_parabolas_are_taken_exactly_and_lines_are_lines(frames: int, rng: np.random.Generator) -> None:
+def test_parabolas_are_taken_exactly_and_lines_are_lines_and_noise_is_found(
+    frames: int, rng: np.random.Generator
+) -> None:
     time = np.arange(frames) - 1.0
     start, velocity, bend = rng.normal(0.0, 1.0, (3, 200, 1, 3)) * np.array([5.0, 0.2, 0.02]).reshape(3, 1, 1, 1)
-    places = start + velocity * time[:, np.newaxis] + 0.5 * bend * time[:, np.newaxis] ** 2
-    sigma = np.full(places.shape, 1e-6)
+    straight = start + velocity * time[:, np.newaxis]
+    places, sigma = straight + 0.5 * bend * time[:, np.newaxis] ** 2, np.full(straight.shape, 1e-6)
     state = fit_in_time(places, sigma, time, scatter_of([(places, sigma)], time))
     np.testing.assert_allclose(state.velocity, velocity[:, 0], atol=1e-6)
-    straight = places - 0.5 * bend * time[:, np.newaxis] ** 2
     noisy, sigma = straight + rng.normal(0.0, 0.01, straight.shape), np.full(straight.shape, 0.01)
     scatter = scatter_of([(noisy, sigma)], time)
     # Of 200 tracks the noise is known to 8 %; what that leaves of a bending is half of the noise of one, at most.
@@ -177,12 +287,9 @@ def test_parabolas_are_taken_exactly_and_lines_are_lines(frames: int, rng: np.ra
     # The slope of a line through equally good places.
     expected = 0.01 / np.sqrt(np.sum((time - time.mean()) ** 2))
     np.testing.assert_allclose(state.velocity_sigma, expected, rtol=1e-3)
-
-
-def test_noise_that_is_not_as_stated_is_found(rng: np.random.Generator) -> None:
+    # Noise that is twice as stated: of 1,600 degrees of freedom a component 3 %, and medians tell half as much.
     noisy, sigma, time = rng.normal(0.0, 0.02, (400, 7, 3)), np.full((400, 7, 3), 0.01), np.arange(7.0) - 3.0
     scatter = scatter_of([(noisy, sigma)], time)
-    # 1,600 degrees of freedom a component: 3 %, and medians tell half as much.
     np.testing.assert_allclose(scatter.noise, 2.0, rtol=0.1)
     state = fit_in_time(noisy, sigma, time, scatter)
     assert np.std(state.velocity / state.velocity_sigma) == pytest.approx(1.0, abs=0.1)
@@ -205,17 +312,6 @@ def test_velocities_on_circles_are_within_their_errors(rng: np.random.Generator,
     # where nothing bends, nothing is allowed for
     assert scatter.twisting[1] < 1e-9
     assert np.median(state.velocity_sigma[:, 1]) < 1.3 * 5e-4 / np.sqrt(np.sum(time**2))
-
-
-def test_a_track_s_own_past_goes_before_its_neighbours(rng: np.random.Generator) -> None:
-    """Each particle moves in its own way, as in a flow with vortices smaller than the particles' distance."""
-    start = rng.uniform(0.0, BOX_MM, (400, 3))
-    moved = rng.normal(0.0, 0.25, start.shape)
-    noise = rng.normal(0.0, NOISE_MM, start.shape)
-    forecast = Forecast(moved + noise, np.broadcast_to(NOISE_MM, start.shape))
-    for prediction, least, most in ((forecast, 0.95, 1.0), (None, 0.0, 0.5)):
-        links = track(Seen(start), Seen(start + moved), 0.8, SCALE, prediction)
-        assert least * 400 <= np.sum(links.first == links.second) <= most * 400
 
 
 @pytest.mark.parametrize(("turn_rad", "half_frames"), [(0.0, 3), (0.8, 2)])
@@ -251,9 +347,67 @@ def test_few_particles_are_followed_through_a_frame_that_lost_one(count: int, rn
     assert not scatter.bending_known
 
 
-def test_tracks_go_on_over_a_frame_without_particles(rng: np.random.Generator) -> None:
-    start = rng.uniform(-2.0, 2.0, (100, 3))
+def test_tracks_go_on_over_a_frame_without_particles_and_nothing_gives_none(rng: np.random.Generator) -> None:
+    start, empty = rng.uniform(-2.0, 2.0, (100, 3)), seen(np.zeros((0, 3)))
     frames = [seen(start + k * np.array([0.1, 0.0, 0.0]) + rng.normal(0.0, 0.001, start.shape)) for k in range(5)]
-    found = follow([*frames[:3], seen(np.zeros((0, 3))), frames[4]], 0.4, 4, SCALE)
+    found = follow([*frames[:3], empty, frames[4]], 0.4, 4, SCALE)
     assert found.count == 100
     assert found.lengths().tolist() == [4] * 100
+    found = follow([empty] * 4, 0.4, 3, SCALE)
+    assert found.count == 0
+    assert states_at(found, [empty] * 4, 1.5, *scatter_in(found, [empty] * 4))[0].size == 0
+
+
+EVEN_FRAMES, EVEN_TRACKS, OTHERS = 7, 50, 5
+EVEN_DT_S = 0.5
+
+
+@pytest.fixture
+def sequence(rng: np.random.Generator) -> SequenceTracks:
+    """Particles that move evenly, each missed once, and some of no track, in any order."""
+    start, moved = rng.random((EVEN_TRACKS, 3)), 0.1 * rng.random((EVEN_TRACKS, 3))
+    frames, labels, probability = [], [], []
+    for number in range(EVEN_FRAMES):
+        track = rng.permutation(np.append(np.delete(np.arange(EVEN_TRACKS), number), np.full(OTHERS, NO_TRACK)))
+        place = np.where(track[:, np.newaxis] == NO_TRACK, 5.0, start[track] + number * moved[track])
+        covariance = np.tile([1e-6, 1e-6, 1e-6, 0.0, 0.0, 0.0], (len(track), 1))
+        frames.append(Seen(place + rng.normal(0.0, 1e-3, place.shape), covariance))
+        labels.append(track)
+        probability.append(np.where((track == NO_TRACK) | (number == 0), np.nan, rng.random(len(track))))
+    return SequenceTracks.of(Trajectories(tuple(labels), EVEN_TRACKS, tuple(probability)), frames, EVEN_DT_S)
+
+
+def test_a_frame_at_a_time_is_as_all_of_them_together(sequence: SequenceTracks) -> None:
+    every = [sequence.at(number) for number in range(EVEN_FRAMES)]
+    together = {name: np.concatenate([rows[name] for rows in every]) for name in every[0]}
+    arrays, order = sequence.by_track(), np.lexsort([together[name] for name in ("frame", "track")])
+    assert set(arrays) == set(together)
+    for name, array in arrays.items():
+        np.testing.assert_array_equal(array, together[name][order])
+    assert sequence.summary()["tracked"] == len(arrays["track"]) == EVEN_FRAMES * (EVEN_TRACKS - 1)
+    # Each place is its particle's, and links are as wrong as all places say.
+    for number, rows in enumerate(every):
+        here = rows["particle"]
+        np.testing.assert_array_equal(sequence.found.labels[number][here], rows["track"])
+        np.testing.assert_allclose(rows[POSITION], sequence.frames[number].position_mm[here], rtol=0.0, atol=6e-3)
+    assert sequence.found.expected_wrong_links() == float(np.nansum(1.0 - together["link_probability"]))
+    # Paths are the states half way.
+    paths = list(sequence.paths())
+    assert len(paths) == EVEN_FRAMES - 1
+    for number, path in enumerate(paths):
+        state = states_at(sequence.found, sequence.frames, number + 0.5, sequence.scatter, sequence.half_frames)[1]
+        np.testing.assert_array_equal(path.middle_mm, state.position_mm)
+        np.testing.assert_array_equal(path.displacement_mm, state.velocity)
+
+
+@pytest.mark.parametrize("cuts", [[], [3], [40, 41, 200], [0, 290]])
+def test_scatter_is_that_of_all_pieces(cuts: list[int], rng: np.random.Generator) -> None:
+    time = np.arange(5.0)
+    position = rng.random((300, 1, 3)) + time[:, np.newaxis] ** 2 * 0.01 + rng.normal(0.0, 1e-2, (300, 5, 3))
+    sigma = rng.uniform(5e-3, 2e-2, position.shape)
+    position[rng.random((300, 5)) < 0.3] = np.nan
+    sigma[np.isnan(position)] = np.nan
+    whole = scatter_of([(position, sigma)], time)
+    pieces = scatter_of(zip(np.split(position, cuts), np.split(sigma, cuts), strict=True), time)
+    assert (whole.noise_known, whole.bending_known) == (True, True)
+    np.testing.assert_array_equal([pieces.noise, pieces.bending], [whole.noise, whole.bending])

@@ -1,6 +1,6 @@
 """Spline fields: their integrals, equations, weights and errors."""
 
-from __future__ import annotations
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -77,34 +77,28 @@ def test_slopes_are_those_of_finite_differences(axis: int) -> None:
     np.testing.assert_allclose(rows(LATTICE, points, axis), expected, atol=1e-8)
 
 
-def gauss_points(lattice: Lattice) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return points (n, 3) and weights (n,) that integrate products of splines over the box exactly."""
+def test_the_divergence_s_integral_is_that_of_the_field() -> None:
     nodes, weights = np.polynomial.legendre.leggauss(4)
+    # Points and weights that integrate products of splines over the box exactly.
     at = [
-        lattice.low_mm[a] + lattice.cell_mm[a] * (np.arange(lattice.cells[a])[:, None] + 0.5 + 0.5 * nodes).ravel()
+        LATTICE.low_mm[a] + LATTICE.cell_mm[a] * (np.arange(LATTICE.cells[a])[:, None] + 0.5 + 0.5 * nodes).ravel()
         for a in range(3)
     ]
-    of = [0.5 * lattice.cell_mm[a] * np.tile(weights, lattice.cells[a]) for a in range(3)]
+    of = [0.5 * LATTICE.cell_mm[a] * np.tile(weights, LATTICE.cells[a]) for a in range(3)]
     points = np.stack(np.meshgrid(*at, indexing="ij"), axis=-1).reshape(-1, 3)
-    return points, np.einsum("i,j,k->ijk", *of).ravel()
-
-
-def test_the_divergence_s_integral_is_that_of_the_field() -> None:
     coefficients = np.random.default_rng(3).normal(size=LATTICE.unknowns)
     nx, ny, nz = LATTICE.shape
     parts = coefficients.reshape(nx, 3, ny * nz).transpose(1, 0, 2).reshape(3, -1)
-    points, weights = gauss_points(LATTICE)
     divergence = sum(rows(LATTICE, points, axis) @ parts[axis] for axis in range(3))
     matrix = stencils.dense(stencils.divergence(LATTICE))
-    assert coefficients @ matrix @ coefficients == pytest.approx(float(weights @ np.square(divergence)), rel=1e-11)
+    expected = float(np.einsum("i,j,k->ijk", *of).ravel() @ np.square(divergence))
+    assert coefficients @ matrix @ coefficients == pytest.approx(expected, rel=1e-11)
 
 
 @pytest.mark.parametrize(("order", "free"), [(2, 1), (3, 2)])
 def test_smoothness_does_not_see_polynomials_of_lower_degree(order: int, free: int) -> None:
-    rng = np.random.default_rng(4)
-    points = drawn(rng, 400)
-    design = rows(LATTICE, points)
-    matrix = np.zeros((*LATTICE.shape, 7, 7, 7))
+    points = drawn(np.random.default_rng(4), 400)
+    design, matrix = rows(LATTICE, points), np.zeros((*LATTICE.shape, 7, 7, 7))
     matrix += stencils.smoothness(LATTICE, order)
     whole = stencils.empty(LATTICE, 1)
     stencils.add_scalar(whole, 1.0, matrix)
@@ -113,42 +107,34 @@ def test_smoothness_does_not_see_polynomials_of_lower_degree(order: int, free: i
         values = (points @ np.array([1.0, 2.0, -1.0])) ** degree
         coefficients = np.linalg.lstsq(design, values, rcond=None)[0]
         assert (coefficients @ dense @ coefficients > 1e-6) == sees
+    # Expectations add up.
+    expected = Expectation({SECOND: 2.0, THIRD: 3.0, DIVERGENCE: 5.0}, 0.5, 1.0, 0.0)
+    whole = bound(LATTICE, 0.5) + 5.0 * stencils.divergence(LATTICE)
+    stencils.add_scalar(whole, 1.0, 2.0 * stencils.smoothness(LATTICE, 2) + 3.0 * stencils.smoothness(LATTICE, 3))
+    np.testing.assert_allclose(expected_inverse(LATTICE, expected), whole, rtol=1e-12)
 
 
-def test_normal_equations_are_those_of_the_design() -> None:
+def test_normal_equations_are_those_of_the_design_and_compiled_loops_the_interpreted_ones() -> None:
     rng = np.random.default_rng(5)
     points, weight = drawn(rng, 40), covariances(rng, 40)
-    matrix = stencils.empty(LATTICE)
+    matrix, design = stencils.empty(LATTICE), three_rows(LATTICE, points)
     stencils.add_samples(matrix, LATTICE, points, weight)
-    design = three_rows(LATTICE, points)
-    np.testing.assert_allclose(
-        stencils.dense(matrix), np.einsum("nia,nij,njb->ab", design, weight, design), rtol=1e-12, atol=1e-13
-    )
+    expected = np.einsum("nia,nij,njb->ab", design, weight, design)
+    np.testing.assert_allclose(stencils.dense(matrix), expected, rtol=1e-12, atol=1e-13)
     values = rng.normal(size=(40, 3))
     right = stencils.right_hand_side(LATTICE, points, values)
     np.testing.assert_allclose(right.ravel(), np.einsum("nia,ni->a", design, values), rtol=1e-12, atol=1e-13)
-
-
-def test_compiled_loops_are_the_interpreted_ones() -> None:
-    rng = np.random.default_rng(6)
-    points, weight = drawn(rng, 10), covariances(rng, 10)
-    matrix = stencils.empty(LATTICE)
-    stencils.add_samples(matrix, LATTICE, points, weight)
     plain = stencils.empty(LATTICE)
     first, (x, y, z) = LATTICE.splines_at(points)
     interpreted = getattr(stencils._add_samples, "py_func", stencils._add_samples)
     interpreted((0, len(plain)), plain, first, x, y, z, weight)
-    np.testing.assert_allclose(matrix, plain, rtol=1e-14, atol=1e-15)
-
-
-def long_lattice() -> Lattice:
-    """Return a lattice of three blocks of planes, the last one shorter."""
-    return Lattice.over((0.0, 0.0, 0.0), (5.0, 1.0, 1.0), 1.0)
+    np.testing.assert_allclose(matrix, plain, rtol=1e-13, atol=1e-14)
 
 
 def test_the_factor_solves_and_knows_its_inverse() -> None:
     rng = np.random.default_rng(7)
-    lattice = long_lattice()
+    # Three blocks of planes, the last one shorter.
+    lattice = Lattice.over((0.0, 0.0, 0.0), (5.0, 1.0, 1.0), 1.0)
     matrix = stencils.empty(lattice)
     for axis in range(3):
         matrix[:, axis, :, :, 3, axis, 3, 3] = 0.1
@@ -189,16 +175,13 @@ def test_a_sample_s_error_without_itself_is_that_of_a_fit_without_it() -> None:
     np.testing.assert_allclose(wide[17], covariance[17] + design[17] @ inverse_alone @ design[17].T, atol=1e-9)
 
 
-def test_a_far_sample_does_not_belong() -> None:
+def test_a_far_sample_does_not_belong_and_errors_of_places_turn_into_those_of_values_by_the_gradient() -> None:
     samples = Samples(np.zeros((3, 3)), np.zeros((3, 3)), 1e-4 * np.tile(np.eye(3), (3, 1, 1)), np.array([1, 1, 0.5]))
     error = np.array([[0.0, 0.01, 0.0], [0.1, 0.0, 0.0], [0.0, 0.02, 0.0]])
     found = belonging(samples, error, samples.covariance_mm2, 0.3)
     assert found[0] > 0.99
     assert found[1] < 1e-6
     assert 0.9 < found[2] < found[0]
-
-
-def test_errors_of_places_turn_into_errors_of_values_by_the_gradient() -> None:
     samples = Samples(np.zeros((1, 3)), np.zeros((1, 3)), np.diag([0.0, 0.0, 4e-4])[np.newaxis], np.ones(1))
     gradient = np.zeros((1, 3, 3))
     gradient[0, 0, 2] = 0.5
@@ -227,18 +210,14 @@ def swelling(points: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(0.1 * points * np.exp(-np.sum(points**2, axis=1, keepdims=True) / 4.0))
 
 
-def camera_covariances(points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return errors as a light-field camera's: in depth twenty times the lateral ones, along the line to the lens."""
-    direction = np.array([0.0, 0.0, -200.0]) - points
-    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    return 1e-4 * direction[:, :, np.newaxis] * direction[:, np.newaxis] + 2.5e-7 * np.eye(3)
-
-
 def tracks(flow, count: int, seed: int, wrong: int = 0) -> Samples:  # type: ignore[no-untyped-def]
     """Return samples of a flow, the first ones wrong by half a millimetre."""
     rng = np.random.default_rng(seed)
     points = rng.uniform(LOW, HIGH, (count, 3))
-    covariance = camera_covariances(points)
+    # As a light-field camera's: in depth twenty times the lateral ones, along the line to the lens.
+    direction = np.array([0.0, 0.0, -200.0]) - points
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    covariance = 1e-4 * direction[:, :, np.newaxis] * direction[:, np.newaxis] + 2.5e-7 * np.eye(3)
     error = np.einsum("nij,nj->ni", np.linalg.cholesky(covariance), rng.normal(size=(count, 3)))
     values = flow(points) + error
     away = rng.normal(size=(wrong, 3))
@@ -261,51 +240,39 @@ def solenoidal_share(field: Field, points: NDArray[np.float64]) -> float:
     return float(np.sqrt(np.mean(np.einsum("nii->n", gradient) ** 2) / np.mean(gradient**2)))
 
 
-@pytest.fixture(scope="module")
-def of_vortices() -> SplineField:
-    return fitted(tracks(vortices, MANY, 9))
+def off(field: Field, flow, points: NDArray[np.float64], axis: int | None = 0):  # type: ignore[no-untyped-def]
+    """Return the rms error at points, by component or (axis None) of all."""
+    return np.sqrt(np.mean((field.value_at(points) - flow(points)) ** 2, axis=axis))
 
 
 @pytest.mark.thorough
 def test_a_linear_field_is_found_beyond_its_samples_errors() -> None:
-    points = inner(50, 10)
-    field = fitted(tracks(shear, MANY, 10))
-    error = field.value_at(points) - shear(points)
+    points, field = inner(50, 10), fitted(tracks(shear, MANY, 10))
     # four unknowns of many samples with errors of 0.0005, 0.0005 and 0.01 mm: a fifth of one sample's error, and as
     # much again for what the penalties let pass
-    assert np.all(np.sqrt(np.mean(error**2, axis=0)) < [2e-4, 2e-4, 4e-3])
+    assert np.all(off(field, shear, points) < [2e-4, 2e-4, 4e-3])
     np.testing.assert_allclose(field.gradient_at(points)[:, 0, 2], 0.05, atol=2e-3)
 
 
 @pytest.mark.thorough
-def test_depth_gains_by_what_a_liquid_cannot_do(of_vortices: SplineField) -> None:
-    points = inner(300, 11)
-    rms = [
-        np.sqrt(np.mean((field.value_at(points) - vortices(points)) ** 2, axis=0))
-        for field in (of_vortices, fitted(tracks(vortices, MANY, 9), "off"))
-    ]
+def test_depth_gains_by_what_a_liquid_cannot_do_and_stated_errors_cover_the_truth() -> None:
+    field, points = fitted(tracks(vortices, MANY, 9)), inner(300, 11)
     # without it w is as good as smoothness alone makes it
-    assert rms[0][2] < 0.75 * rms[1][2]
-    assert solenoidal_share(of_vortices, points) < 0.03
-
-
-@pytest.mark.thorough
-def test_stated_errors_cover_the_truth(of_vortices: SplineField) -> None:
+    assert off(field, vortices, points)[2] < 0.75 * off(fitted(tracks(vortices, MANY, 9), "off"), vortices, points)[2]
+    assert solenoidal_share(field, points) < 0.03
     points = inner(400, 12)
-    error = of_vortices.value_at(points) - vortices(points)
-    covered = np.mean(np.abs(error) < 1.96 * np.sqrt(of_vortices.variance_at(points)), axis=0)
+    error, variance = field.value_at(points) - vortices(points), field.variance_at(points)
     # of 400 points some sixty are independent: 0.95 less three standard errors
-    assert np.all(covered > 0.87)
+    assert np.all(np.mean(np.abs(error) < 1.96 * np.sqrt(variance), axis=0) > 0.87)
     # and not because they are large
-    assert np.all(np.sqrt(np.median(of_vortices.variance_at(points), axis=0)) < [3e-3, 3e-3, 8e-3])
+    assert np.all(np.sqrt(np.median(variance, axis=0)) < [3e-3, 3e-3, 8e-3])
 
 
 @pytest.mark.thorough
 def test_sources_are_not_bent_in_silence() -> None:
     samples, points = tracks(swelling, MANY, 13), inner(200, 13)
     penalised, free = fitted(samples), fitted(samples, "free")
-    error = penalised.value_at(points) - swelling(points)
-    assert np.sqrt(np.mean(error[:, :2] ** 2)) < 1e-3
+    assert np.sqrt(np.mean(off(penalised, swelling, points)[:2] ** 2)) < 1e-3
     assert solenoidal_share(penalised, points) > 0.5
     assert free.reduced_chi2 > 2.0 * penalised.reduced_chi2
 
@@ -313,25 +280,19 @@ def test_sources_are_not_bent_in_silence() -> None:
 @pytest.mark.thorough
 def test_wrong_links_lose_their_weight() -> None:
     samples, points = tracks(vortices, MANY, 14, wrong=5), inner(200, 14)
-    field = fitted(samples)
+    field, right = fitted(samples), fitted(samples.subset(np.arange(5, MANY)))
     assert np.all(field.probability[:5] < 0.05)
     assert np.mean(field.probability[5:]) > 0.95
-    right = samples.subset(np.arange(5, MANY))
-    rms = [np.sqrt(np.mean((each.value_at(points) - vortices(points)) ** 2)) for each in (field, fitted(right))]
-    assert rms[0] < 1.2 * rms[1]
+    assert off(field, vortices, points, None) < 1.2 * off(right, vortices, points, None)
 
 
 @pytest.mark.thorough
 def test_flows_that_splines_cannot_follow_are_kriged(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(stencils, "MOST_SPLINES", 66)
     samples, points = tracks(vortices, MANY, 18), inner(100, 18)
-    assert fit_field(samples, LOW, HIGH).told()["method"] == "kriging"
-    free = fitted(samples, "free")
-    rms = [
-        np.sqrt(np.mean((each.value_at(points) - vortices(points)) ** 2))
-        for each in (fit_field(samples, LOW, HIGH), free)
-    ]
-    assert rms[0] < 0.5 * rms[1]
+    kriged, free = fit_field(samples, LOW, HIGH), fitted(samples, "free")
+    assert kriged.told()["method"] == "kriging"
+    assert off(kriged, vortices, points, None) < 0.5 * off(free, vortices, points, None)
 
 
 @pytest.mark.thorough
@@ -343,10 +304,8 @@ def test_few_samples_are_kriged_without_divergence(seed: int) -> None:
     assert not field.probability[:10].any()
     assert np.mean(field.probability) > 0.9
     assert solenoidal_share(field, points) < 1e-6
-    truth = vortices(points)
     # neighbours are 0.75 mm apart in waves of 6 mm; wrong links of half a millimetre would bend it by a third
-    error = np.sqrt(np.mean((field.value_at(points) - truth) ** 2, axis=0))
-    assert np.all(error < 0.1 * np.sqrt(np.mean(truth**2, axis=0)))
+    assert np.all(off(field, vortices, points) < 0.1 * np.sqrt(np.mean(vortices(points) ** 2, axis=0)))
 
 
 @pytest.mark.thorough
@@ -367,14 +326,10 @@ def test_walls_hold_the_field_still() -> None:
 
 @pytest.mark.thorough
 def test_errors_that_are_stated_too_small_are_noticed() -> None:
-    rng = np.random.default_rng(16)
-    samples = tracks(shear, 120, 16)
-    lattice = lattice_for(120, LOW, HIGH)
-    stated = Samples(
-        samples.points_mm, samples.value_mm, samples.covariance_mm2 / 4.0, samples.probability, place_share=0.0
-    )
+    samples, lattice = tracks(shear, 120, 16), lattice_for(120, LOW, HIGH)
+    stated = replace(samples, covariance_mm2=samples.covariance_mm2 / 4.0)
     first = first_expectation(stated, lattice, (SECOND, THIRD, DIVERGENCE))
-    found, _ = most_probable(stated, lattice, first, rng)
+    found, _ = most_probable(stated, lattice, first, np.random.default_rng(16))
     # twice as large; of some hundred samples a part of it is taken for what the field leaves unresolved
     assert 1.5 < found.scale < 2.2
 
@@ -383,11 +338,3 @@ def test_the_same_samples_give_the_same_bits() -> None:
     samples, points = tracks(shear, 30, 17), inner(10, 17)
     once, again = (fit_field(samples, LOW, HIGH).value_at(points) for _ in range(2))
     np.testing.assert_array_equal(once, again)
-
-
-def test_expectations_add_up() -> None:
-    expected = Expectation({SECOND: 2.0, THIRD: 3.0, DIVERGENCE: 5.0}, 0.5, 1.0, 0.0)
-    scalar = 2.0 * stencils.smoothness(LATTICE, 2) + 3.0 * stencils.smoothness(LATTICE, 3)
-    whole = bound(LATTICE, 0.5) + 5.0 * stencils.divergence(LATTICE)
-    stencils.add_scalar(whole, 1.0, scalar)
-    np.testing.assert_allclose(expected_inverse(LATTICE, expected), whole, rtol=1e-12)

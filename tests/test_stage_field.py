@@ -1,8 +1,5 @@
 """`field` as a command: tracks and vectors of a flow in, vectors on the grid of the windows out."""
 
-from __future__ import annotations
-
-import json
 from collections.abc import Callable
 from contextlib import nullcontext
 from pathlib import Path
@@ -17,32 +14,16 @@ from lfpiv_cli.errors import InputError, UsageError
 from lfpiv_cli.fields.structure import Samples
 from lfpiv_cli.files import vtkhdf
 from lfpiv_cli.files.config import Config, load_config
-from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, TRACKS_FORMAT, Points, open_tracks, write_points
+from lfpiv_cli.files.particle_file import TRACKS_FORMAT, Points, open_tracks, write_points
 from lfpiv_cli.flow.correlation import SMALLEST_VALID_FRACTION
 from lfpiv_cli.flow.field import MASKED
 from lfpiv_cli.flow.windows import RoundWall
-from lfpiv_cli.names import Divergence
 from lfpiv_cli.reference import Reference
 from lfpiv_cli.synthetic.flows import pipe
 from lfpiv_cli.verbs.field import FieldOptions, fit_flow, read_places
 from lfpiv_cli.verbs.fields import LARGEST_CHI2, fit_notices, fitted, samples_of_tracks
-from tests.test_particle_stage import CONFIG, run
-
-
-def write_particles(path: Path, place: np.ndarray) -> None:
-    """Write particles that are all alike."""
-    count = len(place)
-    arrays = {
-        "intensity": np.full(count, 1000.0),
-        "covariance_mm2": np.tile([1e-8, 1e-8, 1e-6, 0.0, 0.0, 0.0], (count, 1)),
-        "chi2": np.ones(count),
-        "seen": np.ones(count),
-        "flag": np.zeros(count, np.uint8),
-    }
-    made = {"config": load_config(CONFIG).resolved()}
-    points = Points(place, arrays, Reference("mid_plane", 0.5), {}, made)
-    write_points(path, PARTICLES_FORMAT, points, overwrite=True)
-
+from tests.commands import CONFIG, run, told
+from tests.test_particle_stage import HIGH, LOW, write_frame
 
 MOVED_MM = np.array([0.1, -0.05, 0.02])
 
@@ -55,28 +36,37 @@ def write_tracks(
     full: bool = True,
     flow: Callable[[np.ndarray], np.ndarray] = np.zeros_like,
     changes: dict[str, dict[str, Any]] | None = None,
-) -> None:
+) -> Path:
     """Write tracks, with errors as stated, of a flow that is added to what moves as a whole."""
-    sigma = np.array([1e-3, 1e-3, 1e-2])
-    place = rng.uniform((-1.5, -1.1, -2.0), (1.5, 1.1, 2.0), (count, 3))
+    sigma, dt_s = np.array([1e-3, 1e-3, 1e-2]), 2e-3
+    place = rng.uniform(LOW, HIGH, (count, 3))
     moved = MOVED_MM + flow(place) + sigma * rng.standard_normal((count, 3))
-    dt_s = 2e-3
-    arrays = {
-        "velocity": moved * 1e-3 / dt_s,
-        "velocity_sigma": np.tile(sigma * 1e-3 / dt_s, (count, 1)),
-        "displacement_mm": moved,
-        "particle_a": np.arange(count),
-        "particle_b": np.arange(count),
-        "link_probability": np.full(count, 0.99),
-    }
+    per_s = 1e-3 / dt_s
+    arrays = {"velocity": moved * per_s, "velocity_sigma": np.tile(sigma * per_s, (count, 1))}
+    arrays |= {"displacement_mm": moved, "link_probability": np.full(count, 0.99)}
+    arrays |= dict.fromkeys(("particle_a", "particle_b"), np.arange(count))
     if full:
         arrays["displacement_covariance_mm2"] = np.tile([*sigma**2, 0.0, 0.0, 0.0], (count, 1))
     settings = load_config(CONFIG).overridden("correlation", dt_s=dt_s)
     for section, keys in (changes or {}).items():
         settings = settings.overridden(section, **keys)
-    provenance = {"config": settings.resolved()}
-    points = Points(place, arrays, Reference("mid_plane", 0.5), {"dt_s": settings.correlation.dt_s}, provenance)
+    attributes, made = {"dt_s": settings.correlation.dt_s}, {"config": settings.resolved()}
+    points = Points(place, arrays, Reference("mid_plane", 0.5), attributes, made)
     write_points(path, TRACKS_FORMAT, points, overwrite=True)
+    return path
+
+
+@pytest.fixture
+def fitted_by(
+    tmp_path: Path, rng: np.random.Generator, capsys: pytest.CaptureFixture[str]
+) -> Callable[..., dict[str, Any]]:
+    """What fits, by command with these options, `field.vtkhdf` to tracks, and tells its summary."""
+
+    def fit(*options: object, **how: Any) -> dict[str, Any]:
+        tracks = write_tracks(tmp_path / "tracks.vtkhdf", rng, **how)
+        return told(capsys, "field", tracks, *options, "-o", tmp_path / "field.vtkhdf")
+
+    return fit
 
 
 @pytest.mark.parametrize("no_slip", [True, False])
@@ -87,13 +77,9 @@ def test_the_fluid_stands_still_at_a_pipes_wall(rng: np.random.Generator, no_sli
     place = place[wall.distances_mm(place) < 0.75]
     covariance = np.tile(np.diag([1e-3, 1e-3, 1e-2]) ** 2, (len(place), 1, 1))
     moved = flow(place) * dt_s * 1e3 + rng.normal(0.0, (1e-3, 1e-3, 1e-2), place.shape)
-    settings = Config.from_resolved(
-        {
-            "volume": {"shape_xyz": (30, 24, 24), "voxel_mm": (0.1, 0.1, 0.1)},
-            "correlation": {"dt_s": dt_s, "windows": ((8, 8, 8),), "mask": "pipe"},
-            "pipe": {"radius_mm": 1.0, "no_slip": no_slip},
-        }
-    )
+    sections = {"volume": {"shape_xyz": (30, 24, 24), "voxel_mm": (0.1, 0.1, 0.1)}}
+    sections |= {"correlation": {"dt_s": dt_s, "windows": ((8, 8, 8),), "mask": "pipe"}}
+    settings = Config.from_resolved(sections | {"pipe": {"radius_mm": 1.0, "no_slip": no_slip}})
     found = fitted([Samples(place, moved, covariance, np.ones(len(place)))], settings, "penalised", "tracks")
     at_wall = found.at(wall.points(np.array([-1.0, -1.1, -1.1]), np.array([1.0, 1.1, 1.1]), np.full(3, 0.3)))
     largest = np.abs(at_wall[:, 0]).max() / 0.1
@@ -107,10 +93,8 @@ def test_the_fluid_stands_still_at_a_pipes_wall(rng: np.random.Generator, no_sli
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("full", [True, False])
-def test_field_has_the_flow_of_its_tracks(tmp_path: Path, rng: np.random.Generator, capsys, full: bool) -> None:
-    write_tracks(tmp_path / "tracks.vtkhdf", rng, full=full)
-    run("field", tmp_path / "tracks.vtkhdf", "-o", tmp_path / "field.vtkhdf", "--json")
-    assert json.loads(capsys.readouterr().out)["samples"] == 100
+def test_field_has_the_flow_of_its_tracks(tmp_path: Path, fitted_by: Callable[..., dict[str, Any]], full: bool) -> None:
+    assert fitted_by(full=full)["samples"] == 100
     field = vtkhdf.open_vectors(tmp_path / "field.vtkhdf")
     found = field.displacement_voxel[field.flag == 0] * field.voxel_mm
     np.testing.assert_allclose(found.mean(axis=0), MOVED_MM, atol=3e-3)
@@ -120,17 +104,11 @@ def test_field_has_the_flow_of_its_tracks(tmp_path: Path, rng: np.random.Generat
 
 
 @pytest.mark.thorough
-def test_walls_stand_still_by_command(tmp_path: Path, rng: np.random.Generator, capsys) -> None:
-    wall = 0.5 * load_config(CONFIG).resolved()["channel"]["width_mm"]
-    write_tracks(
-        tmp_path / "tracks.vtkhdf",
-        rng,
-        flow=lambda place: -((place[:, 2:] / wall) ** 2) * MOVED_MM,
-        changes={"channel": {"no_slip": True}},
-    )
-    np.savetxt(tmp_path / "at.csv", [[0.0, 0.0, -wall], [0.3, 0.2, wall], [0.0, 0.0, 0.0]], delimiter=",")
-    run("field", tmp_path / "tracks.vtkhdf", "--at", tmp_path / "at.csv", "-o", tmp_path / "field.vtkhdf", "--json")
-    assert json.loads(capsys.readouterr().out)["method"] == "splines"
+def test_walls_stand_still_by_command(tmp_path: Path, fitted_by: Callable[..., dict[str, Any]]) -> None:
+    wall, at = 0.5 * load_config(CONFIG).resolved()["channel"]["width_mm"], tmp_path / "at.csv"
+    np.savetxt(at, [[0.0, 0.0, -wall], [0.3, 0.2, wall], [0.0, 0.0, 0.0]], delimiter=",")
+    still = {"flow": lambda place: -((place[:, 2:] / wall) ** 2) * MOVED_MM, "changes": {"channel": {"no_slip": True}}}
+    assert fitted_by("--at", at, **still)["method"] == "splines"
     found = np.loadtxt(tmp_path / "field_at.csv", delimiter=",", skiprows=1)
     speed = np.linalg.norm(found[:, 3:6], axis=1)
     # walls hold the field within a thousandth of the displacements' spread
@@ -140,12 +118,8 @@ def test_walls_stand_still_by_command(tmp_path: Path, rng: np.random.Generator, 
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("divergence", ["penalised", "free", "off"])
-def test_what_is_known_of_the_divergence_is_chosen(
-    tmp_path: Path, rng: np.random.Generator, capsys, divergence: str
-) -> None:
-    write_tracks(tmp_path / "tracks.vtkhdf", rng, flow=lambda place: 0.05 * place)
-    run("field", tmp_path / "tracks.vtkhdf", "--divergence", divergence, "-o", tmp_path / "field.vtkhdf", "--json")
-    summary = json.loads(capsys.readouterr().out)
+def test_what_is_known_of_the_divergence_is_chosen(fitted_by: Callable[..., dict[str, Any]], divergence: str) -> None:
+    summary = fitted_by("--divergence", divergence, flow=lambda place: 0.05 * place)
     share = summary["divergence_rms_over_gradients_rms"]
     # the divergence is three times each of three gradients, and their rms counts six that are none
     assert share < 0.05 if divergence == "free" else share == pytest.approx(3.0 * np.sqrt(3.0), rel=0.05)
@@ -153,10 +127,15 @@ def test_what_is_known_of_the_divergence_is_chosen(
         assert summary["reduced_chi2"] > LARGEST_CHI2
 
 
-def test_few_tracks_make_no_field(tmp_path: Path, rng: np.random.Generator) -> None:
-    write_tracks(tmp_path / "tracks.vtkhdf", rng, 5)
+def test_few_tracks_make_no_field_pairs_no_frames_and_no_pressure(tmp_path: Path, rng: np.random.Generator) -> None:
+    tracks, output = write_tracks(tmp_path / "tracks.vtkhdf", rng, 5), tmp_path / "field.vtkhdf"
     with pytest.raises(InputError, match="5 samples, expected at least 20"):
-        run("field", tmp_path / "tracks.vtkhdf", "-o", tmp_path / "field.vtkhdf")
+        run("field", tracks, "-o", output)
+    write_tracks(tracks, rng, 30)
+    with pytest.raises(UsageError, match="one sequence"):
+        fit_flow([tracks], output, FieldOptions(pressure=[tracks]), console=Console(quiet=True))
+    with pytest.raises(UsageError, match="of a pair"):
+        samples_of_tracks(open_tracks(tracks), 1)
 
 
 # What two ways of measuring one flow differ in, and what makes their coordinates or displacements others.
@@ -174,20 +153,16 @@ def test_few_tracks_make_no_field(tmp_path: Path, rng: np.random.Generator) -> N
 def test_measurements_of_one_flow_need_the_same_coordinates_alone(
     section: str, key: str, value: Any, found: str | None, tmp_path: Path, rng: np.random.Generator
 ) -> None:
-    paths = [tmp_path / "a.vtkhdf", tmp_path / "b.vtkhdf"]
-    write_tracks(paths[0], rng)
-    write_tracks(paths[1], rng, changes={section: {key: value}})
-    refused = nullcontext() if found is None else pytest.raises(InputError, match=found)
-    with refused:
+    changes = {"a": {}, "b": {section: {key: value}}}
+    paths = [write_tracks(tmp_path / f"{name}.vtkhdf", rng, changes=each) for name, each in changes.items()]
+    with nullcontext() if found is None else pytest.raises(InputError, match=found):
         fit_flow(paths, tmp_path / "field.vtkhdf", console=Console(quiet=True))
 
 
-def test_velocities_at_points_and_gradients(tmp_path: Path, rng: np.random.Generator, capsys) -> None:
-    write_tracks(tmp_path / "tracks.vtkhdf", rng)
-    (tmp_path / "points.csv").write_text("x,y,z\n0.1, 0.2, 0.3\n\n-0.5,0,1e-1\n", encoding="utf-8")
-    output = tmp_path / "field.vtkhdf"
-    run("field", tmp_path / "tracks.vtkhdf", "--at", tmp_path / "points.csv", "--derived", "-o", output, "--json")
-    told = json.loads(capsys.readouterr().out)
+def test_velocities_at_points_and_gradients(tmp_path: Path, fitted_by: Callable[..., dict[str, Any]]) -> None:
+    points = tmp_path / "points.csv"
+    points.write_text("x,y,z\n0.1, 0.2, 0.3\n\n-0.5,0,1e-1\n", encoding="utf-8")
+    told = fitted_by("--at", points, "--derived")
     # the flow moves as a whole: what is left is of the errors, 0.01 mm in 2 ms at most
     assert 0.0 <= told["kinetic_energy_m2_s2"] < 0.5 * 0.005**2
     assert "dissipation_m2_s3" not in told
@@ -198,32 +173,13 @@ def test_velocities_at_points_and_gradients(tmp_path: Path, rng: np.random.Gener
     # a hundred tracks with errors of 0.001 and 0.01 mm in 2 ms: a third of one track's
     np.testing.assert_allclose(rows[:, 3:6], np.tile(MOVED_MM / 2.0, (2, 1)), atol=2e-3)
     assert np.all(np.abs(rows[:, 3:6] - MOVED_MM / 2.0) < 5.0 * rows[:, 6:])
-    with h5py.File(output) as file:
-        divergence = file["divergence"][()]
+    with h5py.File(tmp_path / "field.vtkhdf") as file:
         trace = sum(file[f"gradient_{name}"][..., axis] for axis, name in enumerate("uvw"))
-    np.testing.assert_allclose(trace, divergence, atol=1e-12)
-
-
-@pytest.mark.parametrize(
-    ("text", "found"), [("", "is empty"), ("\n", "no points"), ("1,2\n", "line 1"), ("1,2,nan\n", "line 1")]
-)
-def test_points_that_are_none_are_named(tmp_path: Path, text: str, found: str) -> None:
-    (tmp_path / "points.csv").write_text(text, encoding="utf-8")
-    with pytest.raises(InputError, match=found):
-        read_places(tmp_path / "points.csv")
-
-
-def test_pressure_needs_a_sequence(tmp_path: Path, rng: np.random.Generator) -> None:
-    write_tracks(tmp_path / "tracks.vtkhdf", rng, 30)
-    options = FieldOptions(pressure=[tmp_path / "tracks.vtkhdf"])
-    with pytest.raises(UsageError, match="one sequence"):
-        fit_flow([tmp_path / "tracks.vtkhdf"], tmp_path / "field.vtkhdf", options, console=Console(quiet=True))
-
-
-def test_a_pair_has_no_frames(rng: np.random.Generator, tmp_path: Path) -> None:
-    write_tracks(tmp_path / "tracks.vtkhdf", rng, 30)
-    with pytest.raises(UsageError, match="of a pair"):
-        samples_of_tracks(open_tracks(tmp_path / "tracks.vtkhdf"), 1)
+        np.testing.assert_allclose(trace, file["divergence"][()], atol=1e-12)
+    for text, found in (("", "is empty"), ("\n", "no points"), ("1,2\n", "line 1"), ("1,2,nan\n", "line 1")):
+        points.write_text(text, encoding="utf-8")
+        with pytest.raises(InputError, match=found):
+            read_places(points)
 
 
 def test_a_sequence_s_samples_are_those_of_its_frame() -> None:
@@ -246,31 +202,23 @@ def test_a_sequence_s_samples_are_those_of_its_frame() -> None:
         samples_of_tracks(points, 3)
 
 
-@pytest.mark.parametrize(
-    ("divergence", "share", "chi2", "belonging", "codes"),
-    [
+def test_doubts_are_told() -> None:
+    for divergence, share, chi2, belonging, codes in (
         ("penalised", 0.01, 0.9, 99, []),
         ("penalised", 0.5, 0.9, 99, ["flow-with-sources"]),
         ("free", 0.01, 3.0, 99, ["field-off-samples"]),
         ("off", 0.5, 0.9, 60, ["samples-left-out"]),
-    ],
-)
-def test_doubts_are_told(divergence: Divergence, share: float, chi2: float, belonging: int, codes: list[str]) -> None:
-    summary = {
-        "divergence_rms_over_gradients_rms": share,
-        "reduced_chi2": chi2,
-        "samples": 100,
-        "samples_belonging": belonging,
-    }
-    assert [notice.code for notice in fit_notices(summary, divergence, "tracks.vtkhdf")] == codes
+    ):
+        summary = {"divergence_rms_over_gradients_rms": share, "reduced_chi2": chi2, "samples": 100}
+        notices = fit_notices(summary | {"samples_belonging": belonging}, divergence, "tracks.vtkhdf")
+        assert [notice.code for notice in notices] == codes
 
 
 @pytest.mark.thorough
 def test_the_grid_of_track_by_splines_is_the_field_of_its_tracks(tmp_path: Path, rng: np.random.Generator) -> None:
-    place = rng.uniform((-1.5, -1.1, -2.0), (1.5, 1.1, 2.0), (80, 3))
-    for name, moved in (("a", 0.0), ("b", MOVED_MM)):
-        write_particles(tmp_path / f"{name}.vtkhdf", place + moved + 1e-4 * rng.standard_normal((80, 3)))
-    pair = [tmp_path / "a.vtkhdf", tmp_path / "b.vtkhdf"]
+    place, pair = rng.uniform(LOW, HIGH, (80, 3)), [tmp_path / "a.vtkhdf", tmp_path / "b.vtkhdf"]
+    for path, moved in zip(pair, (0.0, MOVED_MM), strict=True):
+        write_frame(path, place + moved + 1e-4 * rng.standard_normal((80, 3)))
     run("track", *pair, "--grid", "--by", "spline", "--dt-s", "0.002", "-o", tmp_path / "tracks.vtkhdf", "-q")
     run("field", tmp_path / "tracks.vtkhdf", "-o", tmp_path / "field.vtkhdf", "-q")
     grids = [vtkhdf.open_vectors(tmp_path / name) for name in ("tracks_grid.vtkhdf", "field.vtkhdf")]

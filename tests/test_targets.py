@@ -1,7 +1,5 @@
 """Chessboards and ChArUco boards, rendered and found again; targets that the config does not name."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 
@@ -76,8 +74,8 @@ def test_a_chessboard_is_found_in_both_layouts(camera: Camera, z_mm: float, tilt
 
 
 @pytest.mark.thorough
-def test_a_chessboard_in_focus_and_a_quarter_turn(table2: Camera) -> None:
-    """Turned, the longer side stands along y."""
+def test_a_chessboard_in_focus_and_a_quarter_turn_and_its_magnification(table2: Camera) -> None:
+    # Turned, the longer side stands along y.
     camera = replace(small(table2, 448, 600), column_axis="y")
     board = replace(CHESS, dots=(3, 4))
     placement = BoardPlacement(0.0, (0.07, -0.04), rotation_deg=1.5)
@@ -85,10 +83,6 @@ def test_a_chessboard_in_focus_and_a_quarter_turn(table2: Camera) -> None:
     assert pose.z0_mm == pytest.approx(0.0, abs=4 * pose.z0_sigma_mm)
     np.testing.assert_allclose(pose.offset_mm, placement.offset_mm, atol=2e-3)
     assert pose.indices.max(axis=0).tolist() == [2, 3]
-
-
-@pytest.mark.thorough
-def test_magnification_is_measured(table2: Camera) -> None:
     true = replace(small(table2), magnification=-1.01)
     sheet = replace(true, magnification=-1.0).with_micro_images(true.micro_image_lattice_px())
     pose = locate_board(picture(true, CHESS, BoardPlacement(3.0)), sheet, CHESS, Media())
@@ -105,12 +99,15 @@ def test_a_charuco_board_may_reach_beyond_the_view(table2: Camera) -> None:
     agrees(pose, placement)
 
 
-def test_numbers_grow_with_x_and_y_however_the_board_is_turned() -> None:
+def test_numbers_grow_with_x_and_y_however_the_board_is_turned_and_markers_are_no_dots() -> None:
     numbers = np.array([[0, 0], [3, 0], [0, 2], [3, 2]])
     for turn, expected in ((np.diag([-1.0, -1.0]), [3, 2]), (np.array([[0.0, 1.0], [-1.0, 0.0]]), [2, 0])):
         found, board = upright_numbers(numbers, numbers @ turn, CHESS)
         assert found[0].tolist() == expected
         assert board.dots == ((4, 3) if expected == [3, 2] else (3, 4))
+    # Out of focus its markers are dark, round and even.
+    assert sentence("a board of 9 dark dots", "dots", CHARUCO) is None
+    assert sentence("a board of 9 dark dots", "dots", CHESS) is not None
 
 
 @pytest.mark.thorough
@@ -144,34 +141,27 @@ def test_a_target_of_another_kind_is_named(
         locate_board(at_one_mm(shown), camera, said, Media())
 
 
-def test_squares_of_few_microlenses_are_refused(table2: Camera) -> None:
-    camera = small(table2)
-    with pytest.raises(InputError, match="squares are 4 microlenses wide"):
-        locate_board(
-            np.zeros((camera.rows, camera.columns), np.float32), camera, replace(CHESS, spacing_mm=0.4), Media()
-        )
-
-
-def test_most_dots_of_a_board_must_be_found(table2: Camera) -> None:
+def test_boards_that_are_none_are_refused(table2: Camera, rng: np.random.Generator) -> None:
+    # Many tracers fill a grid of any spacing, and lie anywhere about its points.
     board = BoardGeometry((9, 9), 1.0, 0.2)
+    tracers = rng.uniform(-5.0, 5.0, (2000, 3))
+    with pytest.raises(InputError, match="mm rms off a grid of 1 mm"):
+        pose_of_dots(tracers, np.full(tracers.shape, 1e-3), -tracers[:, :2], table2, board)
+    i, j = np.divmod(np.arange(20), 5)
+    dots = np.column_stack([0.8 * (j - 2.0), 0.8 * (i - 1.5), 2.0 + rng.normal(0.0, 0.5, 20)])
+    with pytest.raises(InputError, match=r"lies 0\.\d+ mm rms in front of and behind one plane, at most 0\.16 mm"):
+        pose_of_dots(dots, np.full(dots.shape, 1e-3), -dots[:, :2], table2, DOTS)
     i, j = np.divmod(np.arange(81), 9)
     dots = np.column_stack([i - 4.0, j - 4.0, np.full(81, 2.0)])
     assert pose_of_dots(dots[:41], np.full((41, 3), 1e-3), -dots[:41, :2], table2, board).dots_found == 41
     with pytest.raises(InputError, match="only 40 of the board's 9 x 9 dots were found.* at least 41 are needed"):
         pose_of_dots(dots[:40], np.full((40, 3), 1e-3), -dots[:40, :2], table2, board)
-
-
-def test_particles_are_no_board(table2: Camera, rng: np.random.Generator) -> None:
-    """Many tracers fill a grid of any spacing, and lie anywhere about its points."""
-    board = BoardGeometry((9, 9), 1.0, 0.2)
-    tracers = rng.uniform(-5.0, 5.0, (2000, 3))
-    with pytest.raises(InputError, match="mm rms off a grid of 1 mm"):
-        pose_of_dots(tracers, np.full(tracers.shape, 1e-3), -tracers[:, :2], table2, board)
-
-
-def test_dots_narrower_than_a_lens_are_refused_for_their_focus(table2: Camera, rng: np.random.Generator) -> None:
-    """Near the focal plane they seem to lie in the middle of their lenses, a grid of 0.1 mm, and not on their own."""
-    i, j = np.divmod(np.arange(81), 9)
+    camera = small(table2)
+    with pytest.raises(InputError, match="squares are 4 microlenses wide"):
+        locate_board(
+            np.zeros((camera.rows, camera.columns), np.float32), camera, replace(CHESS, spacing_mm=0.4), Media()
+        )
+    # Near the focal plane they seem to lie in the middle of their lenses, a grid of 0.1 mm, and not on their own.
     lateral = 0.24 * np.column_stack([i - 4.0, j - 4.0])
     dots = np.column_stack([0.1 * np.rint(lateral / 0.1), rng.normal(0.0, 0.01, 81)])
     for wide, words in (
@@ -180,22 +170,6 @@ def test_dots_narrower_than_a_lens_are_refused_for_their_focus(table2: Camera, r
     ):
         with pytest.raises(InputError, match=f"mm rms off a grid of 0.24 mm, .* {words}"):
             pose_of_dots(dots, np.full(dots.shape, 1e-3), -dots[:, :2], table2, BoardGeometry((9, 9), 0.24, wide))
-
-
-@pytest.mark.thorough
-def test_few_tracers_are_no_small_board(table2: Camera, rng: np.random.Generator) -> None:
-    """Half of a board of 4 x 3 is soon found among tracers, near enough to a grid of which six numbers are free."""
-    for _ in range(40):
-        tracers = rng.uniform(-1.0, 1.0, (25, 3)) * (1.6, 1.2, 0.8)
-        with pytest.raises(InputError):
-            pose_of_dots(tracers, np.full(tracers.shape, 1e-3), -tracers[:, :2], table2, replace(DOTS, dots=(4, 3)))
-
-
-def test_a_board_is_flat(table2: Camera, rng: np.random.Generator) -> None:
-    i, j = np.divmod(np.arange(20), 5)
-    dots = np.column_stack([0.8 * (j - 2.0), 0.8 * (i - 1.5), 2.0 + rng.normal(0.0, 0.5, 20)])
-    with pytest.raises(InputError, match=r"lies 0\.\d+ mm rms in front of and behind one plane, at most 0\.16 mm"):
-        pose_of_dots(dots, np.full(dots.shape, 1e-3), -dots[:, :2], table2, DOTS)
 
 
 ASKEW = BoardPlacement(2.0, (0.07, -0.04), (1.0, -0.5), 1.5)
@@ -224,21 +198,20 @@ def test_an_origin_may_be_missing_larger_or_a_ring(polarity: Polarity, diameters
     agrees(pose, ASKEW)
 
 
-def test_a_charuco_board_is_not_called_dots() -> None:
-    """Out of focus its markers are dark, round and even."""
-    assert sentence("a board of 9 dark dots", "dots", CHARUCO) is None
-    assert sentence("a board of 9 dark dots", "dots", CHESS) is not None
-
-
 @pytest.mark.thorough
-def test_particles_are_called_nothing(table2: Camera, rng: np.random.Generator) -> None:
-    """Nor is white light: OpenCV alone finds three by three corners in both."""
+def test_particles_are_called_nothing_and_few_are_no_small_board(table2: Camera, rng: np.random.Generator) -> None:
+    # Nor is white light: OpenCV alone finds three by three corners in both.
     camera = small(table2)
     points = np.column_stack([rng.uniform(-3.0, 3.0, 300), rng.uniform(-2.5, 2.5, 300), rng.uniform(-3.0, 3.0, 300)])
     tracers = render_points(camera, AIR, Balls(points, 1e4, 0.05), rng, rays=500)
     for image in (tracers, render_white(camera, LEVEL)):
         assert another_kind(image, camera, DOTS) is None
         assert another_kind(image, camera, CHESS) is None
+    # Half of a board of 4 x 3 is soon found among tracers, near enough to a grid of which six numbers are free.
+    for _ in range(40):
+        tracers = rng.uniform(-1.0, 1.0, (25, 3)) * (1.6, 1.2, 0.8)
+        with pytest.raises(InputError):
+            pose_of_dots(tracers, np.full(tracers.shape, 1e-3), -tracers[:, :2], table2, replace(DOTS, dots=(4, 3)))
 
 
 def test_auto_sees_whether_dots_are_bright_or_dark(rng: np.random.Generator) -> None:
@@ -249,18 +222,6 @@ def test_auto_sees_whether_dots_are_bright_or_dark(rng: np.random.Generator) -> 
         image = (np.where(on_dots, dot, ground) * passed + rng.normal(0.0, 5.0, passed.shape)).astype(np.float32)
         found = dot_signal(image, passed, replace(DOTS, polarity="auto"))
         np.testing.assert_array_equal(found, dot_signal(image, passed, replace(DOTS, polarity=polarity)))
-
-
-def test_rays_to_the_plate_are_those_that_the_tracer_follows(camera: Camera, rng: np.random.Generator) -> None:
-    """Back through window and water to a tilted plate, and from there forward again."""
-    camera, media, window = replace(small(camera), distortion_per_mm2=2e-5), Media(1.0, 1.49, 1.33), Window(98.0, 2.0)
-    placement = BoardPlacement(1.5, (0.1, -0.2), (12.0, -7.0), 20.0)
-    steps = placement.to_world([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
-    plate = printed_plate(camera, CHESS, steps)
-    crossing, slope = _rays_to(rng.uniform(0, 440, (50, 2)), np.array([0.02, -0.03]), camera)
-    on_plate = _on_plate(crossing, slope, camera, ObjectSpace(media, window), plate)
-    points = placement.to_world(on_plate)
-    np.testing.assert_allclose(slopes_exact(points, crossing, camera, media, window), slope, atol=1e-8)
 
 
 @pytest.mark.parametrize("z_mm", [0.4, -6.0])
@@ -295,8 +256,10 @@ def test_quadrants_share_what_a_fine_grid_counts(layout: str) -> None:
     np.testing.assert_allclose(shares[4:], [1.0, 0.0], atol=1e-12)
 
 
-def test_a_white_plate_is_a_white_image(camera: Camera) -> None:
-    """Where the plate's margin fills the view there is nothing but the aperture."""
+def test_a_white_plate_is_a_white_image_and_rays_to_it_are_those_of_the_tracer(
+    camera: Camera, rng: np.random.Generator
+) -> None:
+    # Where the plate's margin fills the view there is nothing but the aperture.
     camera = small(camera, 90, 90)
     board = BoardGeometry((2, 2), 40.0, 0.0, pattern="chessboard")
     image = picture(camera, board, BoardPlacement(1.0, (80.0, 0.0)))
@@ -304,3 +267,12 @@ def test_a_white_plate_is_a_white_image(camera: Camera) -> None:
     # A sixteenth of a pixel's rays is the step; between touching micro-images some come from the neighbour.
     assert np.mean(np.abs(image - white)[white > 0.999 * LEVEL] > 0.0) < 0.02
     assert image.sum() == pytest.approx(white.sum(), rel=0.01)
+    # Back through window and water to a tilted plate, and from there forward again.
+    camera, media, window = replace(small(camera), distortion_per_mm2=2e-5), Media(1.0, 1.49, 1.33), Window(98.0, 2.0)
+    placement = BoardPlacement(1.5, (0.1, -0.2), (12.0, -7.0), 20.0)
+    steps = placement.to_world([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
+    plate = printed_plate(camera, CHESS, steps)
+    crossing, slope = _rays_to(rng.uniform(0, 440, (50, 2)), np.array([0.02, -0.03]), camera)
+    on_plate = _on_plate(crossing, slope, camera, ObjectSpace(media, window), plate)
+    points = placement.to_world(on_plate)
+    np.testing.assert_allclose(slopes_exact(points, crossing, camera, media, window), slope, atol=1e-8)

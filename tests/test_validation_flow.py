@@ -1,7 +1,5 @@
 """Figures of merit, against cases worked out by hand."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 
@@ -55,15 +53,24 @@ def inside() -> NDArray[np.bool_]:
     return np.ones(SHAPE, dtype=np.bool_)
 
 
-def test_the_truth_itself_has_no_error(truth: NDArray[np.float64], inside: NDArray[np.bool_]) -> None:
+def test_the_truth_itself_has_no_error_and_a_vortex_no_streamwise_figures(
+    truth: NDArray[np.float64], inside: NDArray[np.bool_]
+) -> None:
     figures = flow_figures(Measured(field_of(truth), truth, inside))
     assert figures["streamwise_mean_error"] == pytest.approx(0.0, abs=1e-12)
     assert figures["within_25_percent_streamwise"] == figures["within_25_percent_vector"] == 1.0
     assert figures["rms_v_voxel"] == pytest.approx(0.0, abs=1e-12)
     assert figures["streamwise_direction"] == pytest.approx([0.0, 1.0, 0.0])
+    vortex = np.zeros((*SHAPE, 3))
+    vortex[..., 1] = 0.1 * (np.arange(5) - 2.0)
+    figures = flow_figures(Measured(field_of(vortex), vortex, inside))
+    assert figures["streamwise_direction"] is figures["within_25_percent_streamwise"] is None
+    assert figures["within_25_percent_vector"] == 1.0
 
 
-def test_components_are_in_their_own_voxels(truth: NDArray[np.float64], inside: NDArray[np.bool_]) -> None:
+def test_components_are_in_their_own_voxels_and_slices_between_planes(
+    truth: NDArray[np.float64], inside: NDArray[np.bool_]
+) -> None:
     measured = truth + (0.01, -0.02, 0.04)
     measured[::2] += (0.02, 0.0, 0.0)
     figures = flow_figures(Measured(field_of(measured), truth, inside))
@@ -75,9 +82,19 @@ def test_components_are_in_their_own_voxels(truth: NDArray[np.float64], inside: 
     # Only v flows at all: 1.0 less 0.02 m/s at speeds of 0.1 to 0.5 m/s.
     assert figures["slope_u"] is figures["slope_w"] is None
     assert figures["slope_v"] == pytest.approx(1.0 - 0.02 * 1.5 / 0.55)
+    measured = truth.copy()
+    measured[..., 0, 1] *= 1.2
+    field = field_of(measured)
+    slices = flow_figures(Measured(field, truth, inside))["slices"]
+    np.testing.assert_allclose(slices["x"]["streamwise_mean_error"], [0.2, 0.0, 0.0, 0.0, 0.0], atol=1e-12)
+    np.testing.assert_allclose(slices["x"]["position_mm"], [0.0, 0.8, 1.6, 2.4, 3.2])
+    # Half-way between the planes of 0.1 (measured 0.12) and 0.2 m/s.
+    assert streamwise_mean_error_at(Measured(field, truth, inside), 0, 0.4) == pytest.approx(0.32 / 0.3 - 1.0)
 
 
-def test_streamwise_and_full_vector_shares_differ(truth: NDArray[np.float64], inside: NDArray[np.bool_]) -> None:
+def test_shares_of_streamwise_and_full_vectors_differ_and_meet_the_cumulative_distribution(
+    truth: NDArray[np.float64], inside: NDArray[np.bool_], rng: np.random.Generator
+) -> None:
     measured = truth.copy()
     measured[0, ..., 1] *= 1.3
     measured[1, ..., 2] += 0.3 * truth[1, ..., 1]
@@ -86,9 +103,13 @@ def test_streamwise_and_full_vector_shares_differ(truth: NDArray[np.float64], in
     assert figures["within_25_percent_streamwise"] == pytest.approx(0.75)
     assert figures["within_25_percent_vector"] == pytest.approx(0.5)
     assert figures["streamwise_mean_error"] == pytest.approx(0.5 / 4)
+    figures = flow_figures(Measured(field_of(truth * rng.uniform(0.5, 1.5, SHAPE)[..., np.newaxis]), truth, inside))
+    shares = figures["cumulative"]["streamwise_share"]
+    assert np.all(np.diff(shares) >= 0.0)
+    assert shares[25] == pytest.approx(figures["within_25_percent_streamwise"])
 
 
-def test_a_miss_lowers_the_shares_and_leaves_the_means(truth: NDArray[np.float64], inside: NDArray[np.bool_]) -> None:
+def test_misses_lower_the_shares(truth: NDArray[np.float64], inside: NDArray[np.bool_]) -> None:
     field = field_of(truth)
     flag = field.flag.copy()
     flag[0] = REJECTED
@@ -98,25 +119,6 @@ def test_a_miss_lowers_the_shares_and_leaves_the_means(truth: NDArray[np.float64
     assert figures["streamwise_mean_error"] == pytest.approx(0.0, abs=1e-12)
     assert figures["cumulative"]["streamwise_share"][-1] == pytest.approx(0.75)
     assert figures["slices"]["z"]["streamwise_mean_error"][0] is None
-
-
-def test_relative_error_of_misses_and_of_fluid_at_rest(inside: NDArray[np.bool_]) -> None:
-    truth = np.zeros((*SHAPE, 3))
-    truth[..., 1] = 0.125
-    truth[0, 0, :2] = 0.0
-    measured = truth.copy()
-    measured[0, 0, 1] = 0.125
-    measured[0, 0, 2] = np.nan
-    pairs = Measured(field_of(truth), truth, inside).pairs
-    streamwise, vector = relative_errors(replace(pairs, measured=measured.reshape(-1, 3)))
-    for errors in (streamwise, vector):
-        assert errors is not None
-        np.testing.assert_array_equal(errors[:4], [0.0, np.inf, np.inf, 0.0])
-    shares = cumulative_distribution(replace(pairs, measured=measured.reshape(-1, 3)))
-    assert shares["vector_share"][0] == shares["vector_share"][-1] == pytest.approx(58 / 60)
-
-
-def test_windows_outside_count_for_nothing(truth: NDArray[np.float64], inside: NDArray[np.bool_]) -> None:
     measured = truth.copy()
     inside[:, :, 0] = False
     measured[:, :, 0] = 9.0
@@ -124,6 +126,19 @@ def test_windows_outside_count_for_nothing(truth: NDArray[np.float64], inside: N
     figures = flow_figures(Measured(field_of(measured), truth, inside))
     assert figures["vectors_inside"] == 48
     assert figures["within_25_percent_vector"] == 1.0
+    truth = np.zeros((*SHAPE, 3))
+    truth[..., 1] = 0.125
+    truth[0, 0, :2] = 0.0
+    measured = truth.copy()
+    measured[0, 0, 1] = 0.125
+    measured[0, 0, 2] = np.nan
+    pairs = Measured(field_of(truth), truth, np.ones(SHAPE, bool)).pairs
+    streamwise, vector = relative_errors(replace(pairs, measured=measured.reshape(-1, 3)))
+    for errors in (streamwise, vector):
+        assert errors is not None
+        np.testing.assert_array_equal(errors[:4], [0.0, np.inf, np.inf, 0.0])
+    shares = cumulative_distribution(replace(pairs, measured=measured.reshape(-1, 3)))
+    assert shares["vector_share"][0] == shares["vector_share"][-1] == pytest.approx(58 / 60)
 
 
 @pytest.mark.parametrize("dt_s", [None, DT_S])
@@ -137,26 +152,6 @@ def test_figures_are_valid_json_without_nan(
     assert figures["within_25_percent_streamwise"] == 0.0
     assert figures["streamwise_mean_error"] is None
     assert figures["rms_u_voxel"] is None
-
-
-def test_a_vortex_has_no_streamwise_figures(inside: NDArray[np.bool_]) -> None:
-    x = np.broadcast_to(np.arange(5) - 2.0, SHAPE)
-    truth = np.stack([np.zeros(SHAPE), 0.1 * x, np.zeros(SHAPE)], axis=-1)
-    figures = flow_figures(Measured(field_of(truth), truth, inside))
-    assert figures["streamwise_direction"] is None
-    assert figures["within_25_percent_streamwise"] is None
-    assert figures["within_25_percent_vector"] == 1.0
-
-
-def test_slices_are_planes_and_between_them_interpolated(truth: NDArray[np.float64], inside: NDArray[np.bool_]) -> None:
-    measured = truth.copy()
-    measured[..., 0, 1] *= 1.2
-    field = field_of(measured)
-    slices = flow_figures(Measured(field, truth, inside))["slices"]
-    np.testing.assert_allclose(slices["x"]["streamwise_mean_error"], [0.2, 0.0, 0.0, 0.0, 0.0], atol=1e-12)
-    np.testing.assert_allclose(slices["x"]["position_mm"], [0.0, 0.8, 1.6, 2.4, 3.2])
-    # Half-way between the planes of 0.1 (measured 0.12) and 0.2 m/s.
-    assert streamwise_mean_error_at(Measured(field, truth, inside), 0, 0.4) == pytest.approx(0.32 / 0.3 - 1.0)
 
 
 def test_table_4_takes_the_paper_s_slices_of_a_duct() -> None:
@@ -228,15 +223,6 @@ def test_a_pipes_figures_go_by_the_distance_from_its_axis() -> None:
     assert len(told["measured"].get_xdata()) == inside.sum() - 1
 
 
-def test_cumulative_distribution_meets_the_share(
-    truth: NDArray[np.float64], inside: NDArray[np.bool_], rng: np.random.Generator
-) -> None:
-    figures = flow_figures(Measured(field_of(truth * rng.uniform(0.5, 1.5, SHAPE)[..., np.newaxis]), truth, inside))
-    shares = figures["cumulative"]["streamwise_share"]
-    assert np.all(np.diff(shares) >= 0.0)
-    assert shares[25] == pytest.approx(figures["within_25_percent_streamwise"])
-
-
 @pytest.mark.parametrize("what", ["shape", "nothing inside", "truth"])
 def test_what_cannot_be_compared_is_refused(what: str, truth: NDArray[np.float64], inside: NDArray[np.bool_]) -> None:
     field = field_of(truth)
@@ -257,6 +243,8 @@ def test_truth_from_particles_is_exact_for_a_linear_flow(rng: np.random.Generato
     centres = rng.uniform(-5.0, 5.0, (2, 3, 4, 3))
     fitted = truth_at_points(positions, velocities, centres)
     np.testing.assert_allclose(fitted, centres @ gradient + (0.1, 0.2, 0.3), atol=1e-9)
+    with pytest.raises(InputError):
+        truth_at_points(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((1, 3)))
 
 
 @pytest.mark.parametrize("count", [1, 3, 40])
@@ -269,11 +257,6 @@ def test_truth_from_few_or_level_particles_stays_finite(count: int, rng: np.rand
     assert 0.0 < fitted[0, 0] <= 0.1 + 1e-9
 
 
-def test_truth_needs_particles() -> None:
-    with pytest.raises(InputError):
-        truth_at_points(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((1, 3)))
-
-
 @pytest.fixture
 def methods(truth: NDArray[np.float64], inside: NDArray[np.bool_]) -> dict[str, Measured]:
     """One method that errs by a tenth and has missed a column of windows, and a perfect one."""
@@ -284,7 +267,7 @@ def methods(truth: NDArray[np.float64], inside: NDArray[np.bool_]) -> dict[str, 
     return {name: Measured(field, truth, inside) for name, field in fields.items()}
 
 
-def test_the_picture_shows_truth_and_methods_in_three_planes_on_one_scale(
+def test_pictures_show_truth_and_methods_on_one_scale(
     methods: dict[str, Measured], truth: NDArray[np.float64], inside: NDArray[np.bool_]
 ) -> None:
     pytest.importorskip("matplotlib")
@@ -297,10 +280,6 @@ def test_the_picture_shows_truth_and_methods_in_three_planes_on_one_scale(
     shown = np.where(inside, truth[..., 1], np.nan)[:, SHAPE[1] // 2]
     np.testing.assert_allclose(np.ma.filled(panels[0, 1].images[0].get_array(), np.nan), shown)
     np.testing.assert_allclose(np.ma.filled(panels[1, 1].images[0].get_array(), np.nan), 1.1 * shown)
-
-
-def test_errors_of_methods_are_on_one_scale_a_component(methods: dict[str, Measured]) -> None:
-    pytest.importorskip("matplotlib")
     from lfpiv_cli.validation.methods import errors_figure
 
     figure = errors_figure(methods)
@@ -315,12 +294,6 @@ def test_errors_of_methods_are_on_one_scale_a_component(methods: dict[str, Measu
         shown[1:], 1e3 * np.where(methods["volumes"].inside[..., np.newaxis], error, np.nan)[SHAPE[0] // 2, 1:, :, 1]
     )
     assert np.isnan(shown[0]).all()
-
-
-def test_profiles_are_over_the_windows_that_all_have_found(
-    methods: dict[str, Measured], truth: NDArray[np.float64]
-) -> None:
-    pytest.importorskip("matplotlib")
     from lfpiv_cli.validation.methods import profiles_figure
 
     panel = np.array(profiles_figure(methods).axes[:9]).reshape(3, 3)[1, 0]

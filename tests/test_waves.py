@@ -1,6 +1,4 @@
-"""Light as waves: against a plain quadrature, Airy's disc, one lens's sinc², rays, and in mirrors."""
-
-from __future__ import annotations
+"""Light as waves: against a plain quadrature, Airy's disc, sinc², rays, mirrors; dots and corners by waves."""
 
 from dataclasses import replace
 
@@ -9,6 +7,11 @@ import pytest
 from numpy.typing import NDArray
 from scipy.special import j1
 
+from lfpiv_cli.calibration.board import DotLook, disc_shape, locate_board
+from lfpiv_cli.calibration.board_pose import BoardGeometry
+from lfpiv_cli.calibration.shape_fit import pixels_near
+from lfpiv_cli.calibration.wave_shapes import WaveLight, WaveShapes, corner_strips, disc_strips
+from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.optics import waves
 from lfpiv_cli.optics.camera import Camera, Lattice
 from lfpiv_cli.optics.curved_space import CurvedSpace, Face
@@ -16,15 +19,8 @@ from lfpiv_cli.optics.media import Media, Window, fluid_path_to_focus
 from lfpiv_cli.optics.surfaces import Cylinder, Plane
 from lfpiv_cli.optics.tracing import ObjectSpace, disc_points
 from lfpiv_cli.optics.waves import DEGREE, Waves, WavesInCamera, pixel_response
-from lfpiv_cli.synthetic.board import sunflower
-from lfpiv_cli.synthetic.render import (
-    Balls,
-    lens_blur_mm,
-    lens_spread,
-    points_in_ball,
-    render_points,
-    render_white,
-)
+from lfpiv_cli.synthetic.board import BoardPlacement, render_board, sunflower
+from lfpiv_cli.synthetic.render import Balls, lens_blur_mm, lens_spread, points_in_ball, render_points, render_white
 
 GREEN = Waves(532e-6)
 # Four times as long: a hundredth of the work.
@@ -131,8 +127,10 @@ def test_green_light_is_that_of_a_plain_quadrature(small: Camera, z: float) -> N
     assert apart(by_waves(camera, point), quadrature(camera, point, GREEN.wavelength_mm, 0.0055 / 9.3, 0.045)) < 0.02
 
 
-def test_main_lens_alone_makes_airys_disc(square: Camera, monkeypatch) -> None:
-    """On a sensor right behind an array without power: (2 J1(v) / v)², v = k R r / s_i."""
+def test_main_lens_alone_makes_airys_disc_and_one_lens_in_focus_a_squared_sinc(
+    square: Camera, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # On a sensor right behind an array without power: (2 J1(v) / v)², v = k R r / s_i.
     monkeypatch.setattr(waves, "MARGIN_PITCHES", 3.0)
     bare = replace(
         square, pixel_mm=0.001, microlens_focal_length_mm=1e6, microlens_distance_mm=1e-6, columns=401, rows=401
@@ -143,9 +141,6 @@ def test_main_lens_alone_makes_airys_disc(square: Camera, monkeypatch) -> None:
     peak = np.pi * (12.5 * bare.pixel_mm / (GREEN.wavelength_mm * 200.0)) ** 2
     # samples of the intensity itself; 0.4 % of the light falls beyond the window, and is made up for within it
     assert np.abs(found - peak * (2.0 * j1(v) / v) ** 2).max() < 5e-3 * peak
-
-
-def test_one_lens_in_focus_makes_a_squared_sinc(square: Camera) -> None:
     focused = replace(square, microlens_focal_length_mm=1.0 / (1.0 / 0.8 + 1.0 / 200.0))
     beside = 0.0005 * np.arange(-400, 400)
     found = lens_spread(focused, GREEN, beside)
@@ -162,45 +157,41 @@ def test_energy_is_conserved(small: Camera, diffusion_px: float) -> None:
         assert image.sum() == pytest.approx(1.0, abs=2e-4)
 
 
-def test_shares_of_charge_sum_to_one() -> None:
-    for diffusion in (0.0, 0.1, 0.3, 1.0):
-        response = pixel_response(5, diffusion)
-        assert response.size % 2 == 1
-        # of one sample's charge, over the pixels that lie a whole number of pixels from it
-        of_sample = [response[first::5].sum() for first in range(5)]
-        assert of_sample == pytest.approx(np.ones(5), abs=1e-6)
-
-
-def test_diffusion_widens_by_its_variance(square: Camera) -> None:
-    sharp, blurred = (by_waves(replace(square, diffusion_px=px), (0.0, 0.0, 1.0)) for px in (0.0, 0.8))
-    variance = []
-    for image in (sharp, blurred):
-        column = np.arange(image.shape[1]) - centre(image)[0]
-        variance.append((image.sum(axis=0) * column**2).sum())
-    assert variance[1] - variance[0] == pytest.approx(0.64, abs=0.02)
-
-
-def test_a_sensor_takes_what_falls_on_it(small: Camera) -> None:
+def test_sensors_mirrors_and_axes(small: Camera) -> None:
     point = (0.35, -0.3, 3.0)
     whole, part = by_waves(small, point), by_waves(replace(small, columns=120, rows=140), point)
     assert 0.1 < part.sum() < 0.9
     assert np.array_equal(part, whole[130:270, 140:260])
     assert WavesInCamera(replace(small, columns=60, rows=60), AIR, GREEN).patch([[1.5, 0.0, 1.0]]) is None
+    along_x = by_waves(small, (0.2, -0.05, 2.0))
+    along_y = by_waves(replace(small, column_axis="y"), (-0.05, 0.2, 2.0))
+    assert np.array_equal(along_x, along_y)
+    window = Window(98.0, 2.0)
+    path = fluid_path_to_focus(window, small.focus_distance_mm, WATER)
+    faces = CurvedSpace(WATER, (Face(Plane(-path - 2.0), 1.49), Face(Plane(-path), 1.33)))
+    images = [by_waves(small, (0.2, -0.1, 3.0), space=space) for space in (faces, ObjectSpace(WATER, window))]
+    assert apart(*images) < 1e-3
 
 
-def test_mirrored_points_make_mirrored_images(square: Camera) -> None:
+def test_mirrored_points_make_mirrored_images_and_charge_diffuses(square: Camera) -> None:
     point = (0.113, -0.287, 2.0)
     images = [by_waves(square, (sign * point[0], *point[1:])) for sign in (1, -1)]
     # the window may lie a pixel elsewhere, and what goes beyond it returns elsewhere
     assert apart(images[1][:, ::-1], images[0]) < 1e-3
     turned = by_waves(square, (point[1], point[0], point[2]))
     assert apart(turned.T, images[0]) < 1e-3
-
-
-def test_column_axis_is_applied_once(small: Camera) -> None:
-    along_x = by_waves(small, (0.2, -0.05, 2.0))
-    along_y = by_waves(replace(small, column_axis="y"), (-0.05, 0.2, 2.0))
-    assert np.array_equal(along_x, along_y)
+    for diffusion in (0.0, 0.1, 0.3, 1.0):
+        response = pixel_response(5, diffusion)
+        assert response.size % 2 == 1
+        # of one sample's charge, over the pixels that lie a whole number of pixels from it
+        of_sample = [response[first::5].sum() for first in range(5)]
+        assert of_sample == pytest.approx(np.ones(5), abs=1e-6)
+    sharp, blurred = (by_waves(replace(square, diffusion_px=px), (0.0, 0.0, 1.0)) for px in (0.0, 0.8))
+    variance = []
+    for image in (sharp, blurred):
+        column = np.arange(image.shape[1]) - centre(image)[0]
+        variance.append((image.sum(axis=0) * column**2).sum())
+    assert variance[1] - variance[0] == pytest.approx(0.64, abs=0.02)
 
 
 @pytest.mark.thorough
@@ -241,14 +232,6 @@ def test_light_lies_where_rays_end(table2: Camera, distortion: float) -> None:
     # the distortion moves them by 10 pixels; fringes by a tenth of one
     assert centre(found) == pytest.approx(centre(rays), abs=0.3)
     assert apart(found, rays) < 0.6
-
-
-def test_plane_faces_make_the_images_of_plane_layers(small: Camera) -> None:
-    window = Window(98.0, 2.0)
-    path = fluid_path_to_focus(window, small.focus_distance_mm, WATER)
-    faces = CurvedSpace(WATER, (Face(Plane(-path - 2.0), 1.49), Face(Plane(-path), 1.33)))
-    images = [by_waves(small, (0.2, -0.1, 3.0), space=space) for space in (faces, ObjectSpace(WATER, window))]
-    assert apart(*images) < 1e-3
 
 
 def tube(outer: float) -> CurvedSpace:
@@ -304,7 +287,7 @@ def test_sixteen_points_are_a_ball_of_fifty_micrometres(square: Camera) -> None:
         assert apart(few, many) < 0.02
 
 
-def test_same_bits_for_any_number_of_threads(small: Camera, rng, one_thread) -> None:
+def test_same_bits_for_any_number_of_threads(small: Camera, rng: np.random.Generator, one_thread) -> None:
     balls = Balls(rng.uniform(-0.4, 0.4, (7, 3)), rng.uniform(1.0, 2.0, 7), 0.05)
     done: list[int] = []
     image = render_points(small, AIR, balls, NO_RAYS, waves=Waves(2e-3, 5), progress=done.append)
@@ -335,15 +318,11 @@ def test_white_light_is_that_of_each_place_on_the_aperture(square: Camera) -> No
 
 
 @pytest.mark.thorough
-def test_white_light_of_short_waves_is_that_of_rays(small: Camera) -> None:
+def test_white_light_of_short_waves_is_that_of_rays_and_diffuses_alike(small: Camera) -> None:
     camera = replace(small, columns=60, rows=50)
     rays = render_white(camera, 1.0, 16)
     found = [np.abs(render_white(camera, 1.0, waves=Waves(532e-6 / part)) - rays).mean() for part in (1, 3)]
     assert found[1] < 0.5 * found[0] < 0.03
-
-
-@pytest.mark.thorough
-def test_white_light_diffuses_alike_by_rays_and_waves(small: Camera) -> None:
     camera = replace(small, columns=60, rows=50, diffusion_px=0.5)
     rays, found = render_white(camera, 1.0), render_white(camera, 1.0, waves=Waves(532e-6 / 3))
     # sixteen places of a pixel along each axis, and what is left of the waves' own blur
@@ -363,3 +342,79 @@ def test_rays_with_a_lens_blur_are_half_of_the_way_to_a_dot_by_waves(square: Cam
         rays = render_points(square, AIR, balls, rng, rays=20_000, blur_mm=lens_blur_mm(square, GREEN))
         assert apart(rays, dot) == pytest.approx(blurred, abs=0.012)
         assert centre(rays) == pytest.approx(centre(dot), abs=0.03)
+
+
+LIGHT = WaveLight(532e-6, 0.3)
+PLACE = np.array([0.13, 0.07, 0.3])
+BOARD = BoardGeometry((1, 1), 0.6, 0.2)
+RADIUS = 0.5 * BOARD.dot_diameter_mm
+
+
+@pytest.fixture(scope="module")
+def near_camera() -> Camera:
+    """Table 2's optics before a small sensor."""
+    return Camera(-1.0, 100.0, 25.0, 0.8, 0.8, Lattice.regular(0.1, "square"), 0.0055, 160, 150, diffusion_px=0.3)
+
+
+@pytest.fixture(scope="module")
+def shapes(near_camera: Camera) -> WaveShapes:
+    """Shapes at the depth of the dot."""
+    return WaveShapes.of(near_camera, Media(), LIGHT, np.array([PLACE[2]]))
+
+
+@pytest.fixture(scope="module")
+def picture(near_camera: Camera) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
+    """A dot's light and that of a white image."""
+    light = Waves(LIGHT.wavelength_mm)
+    place = BoardPlacement(0.3, (0.13, 0.07))
+    seen = render_board(near_camera, ObjectSpace(Media()), BOARD, place, 1.0, np.random.default_rng(1), waves=light)
+    return seen, render_white(near_camera, 1.0, waves=light).astype(np.float32)
+
+
+def test_a_dot_by_waves_lies_where_it_is(
+    near_camera: Camera, shapes: WaveShapes, picture: tuple[NDArray[np.float64], NDArray[np.float32]]
+) -> None:
+    """By rays it does not: near focus its light comes through few lenses, of which some are lit in part."""
+    look, start = DotLook(*picture, Media(), RADIUS, PLACE[np.newaxis, :2], PLACE[2]), PLACE + (0.004, -0.004, 0.02)
+    by_rays, by_waves = (look.fitted(start, near_camera, BOARD, disc_shape(RADIUS), light) for light in (None, shapes))
+    assert by_rays is not None
+    assert by_waves is not None
+    # A dot of 256 points, 1 % of whose light is astray, is known to some 3 um of depth.
+    assert np.all(np.abs(by_waves.position_mm - PLACE) < (3e-4, 3e-4, 5e-3))
+    assert abs(by_rays.position_mm[2] - PLACE[2]) > 0.015
+    assert by_waves.brightness == pytest.approx(1.0, abs=0.02)
+
+
+def test_a_disc_that_fills_the_scene_is_uniform_light_and_hexagons_are_refused(
+    near_camera: Camera, shapes: WaveShapes
+) -> None:
+    # Its share is 1 of every pixel, whatever the depth: what reaches a pixel comes from within a few lenses.
+    dark = np.zeros((near_camera.rows, near_camera.columns))
+    near = pixels_near((dark, dark.astype(np.float32) + 1.0), near_camera, Media(), PLACE, 0.2, 10_000)
+    assert near is not None
+    shares = shapes.shares(near.rays, PLACE, disc_strips(1.0, shapes.lens_mm))
+    np.testing.assert_allclose(shares, 1.0, atol=2e-3)
+    # Line responses are of square cells.
+    hexagonal = replace(near_camera, lattice=Lattice.regular(0.1, "hexagonal"))
+    with pytest.raises(ConfigError, match="wavelength_nm"):
+        locate_board(np.ones((150, 160), np.float32), hexagonal, BOARD, Media(), light=LIGHT)
+    # And its mean square along both axes, a quarter of the radius's, to the square of the strips' distance.
+    begin, end, aside, width = disc_strips(0.1, 0.1)
+    area = np.sum((end - begin) * width)
+    assert area == pytest.approx(np.pi * 0.1**2, rel=1e-3)
+    assert np.sum((end**3 - begin**3) / 3.0 * width) / area == pytest.approx(0.1**2 / 4.0, rel=2e-3)
+    assert np.sum((end - begin) * width * aside**2) / area == pytest.approx(0.1**2 / 4.0, rel=2e-3)
+
+
+@pytest.mark.parametrize("turn_deg", [0.0, 0.4, -25.0, 45.0, 80.0])
+def test_corners_are_two_squares(turn_deg: float) -> None:
+    """Within a square's side of the corner a strip holds what lies in either quadrant, and no more."""
+    turn = np.deg2rad(turn_deg)
+    edges = 0.6 * np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
+    strips = corner_strips(edges, 0.1)
+    points = np.random.default_rng(3).uniform(-0.4, 0.4, (500, 2))
+    inside = np.prod(points @ np.linalg.inv(edges), axis=1) > 0.0
+    # Which points lie on the strip nearest to them.
+    near = np.abs(strips.aside_mm - points[:, 1:]) <= 0.5 * strips.width_mm
+    held = np.any(near & (strips.begin_mm <= points[:, :1]) & (points[:, :1] < strips.end_mm), axis=1)
+    assert np.mean(held == inside) > 0.98

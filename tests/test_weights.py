@@ -1,23 +1,25 @@
-"""Weights: integrals against rays, operators against dense matrices, adjointness, conservation, conventions."""
-
-from __future__ import annotations
+"""Weights: quadrature and integrals against rays, operators against dense matrices, adjointness, conservation."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from lfpiv_cli.calibration.white import fit_vignetting, relative_transmission, vignetting_surface
 from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.camera import Camera, Lattice
-from lfpiv_cli.optics.media import Media
-from lfpiv_cli.optics.tracing import ObjectSpace, disc_points, trace
+from lfpiv_cli.optics.media import Media, Window
+from lfpiv_cli.optics.tracing import ObjectSpace, PolynomialRays, complete_exponents
+from lfpiv_cli.synthetic.render import render_white
 from lfpiv_cli.weights.build import blur_radius_mm, default_padding, factorise, factorise_through
-from lfpiv_cli.weights.lens_cells import axis_optics, disc_area_below
+from lfpiv_cli.weights.columns import OnDemandOperator
+from lfpiv_cli.weights.lens_cells import MOST_CORNERS, axis_optics, disc_area_below, neighbours, shared_rectangle
 from lfpiv_cli.weights.model import Weights
 from lfpiv_cli.weights.operators import adjoint_reference, forward_reference
-from lfpiv_cli.weights.quadrature import integrate_columns
-from tests.known_rays import slopes_equivalent
+from lfpiv_cli.weights.quadrature import TILES, RayCount, count_rays, integrate_columns, sampling_error
+from lfpiv_cli.weights.scene import aperture_tiles, kernel_scene, on_array, rays_from
+from tests.known_rays import points_counted
 
 RAYS = 400_000
 
@@ -38,13 +40,7 @@ def ray_count(
 ) -> np.ndarray:
     """Return Eq. 13 by counting: the share of the rays of one voxel that strike each pixel."""
     points = grid.voxel_to_mm(np.asarray(voxel_xyz) + rng.random((RAYS, 3)) - 0.5)
-    points = camera.to_image_axes(points)
-    lens = disc_points(RAYS, camera.aperture_radius_mm, rng)
-    hits = trace(camera, lens, slopes_equivalent(points, lens, camera, media))
-    column, row = np.rint(camera.mm_to_px(hits.sensor_mm)).astype(int).T
-    seen = (column >= 0) & (column < camera.columns) & (row >= 0) & (row < camera.rows)
-    counts = np.bincount(row[seen] * camera.columns + column[seen], minlength=camera.rows * camera.columns)
-    return counts.reshape(camera.rows, camera.columns) / RAYS
+    return points_counted(camera.to_image_axes(points), camera, media, rng) / RAYS
 
 
 @pytest.mark.thorough
@@ -94,7 +90,9 @@ def test_kernels_equal_dense_products(small, water, rng, shape):
     np.testing.assert_allclose(operator.adjoint(image), adjoint_reference(operator, image), rtol=1e-5, atol=1e-6)
 
 
-def test_same_bits_for_any_number_of_threads(small, water, rng, one_thread):
+def test_operators_give_the_same_bits_for_any_number_of_threads_and_columns_keep_their_light(
+    small: Camera, water: Media, rng: np.random.Generator, one_thread
+) -> None:
     operator = factorise(small, water, Grid.centred((9, 8, 7), (0.1, 0.1, 0.5), (0.0, 0.0, 0.0)))
     volume = rng.random(operator.shape, dtype=np.float32)
     with one_thread():
@@ -102,9 +100,6 @@ def test_same_bits_for_any_number_of_threads(small, water, rng, one_thread):
         back = operator.adjoint(image)
     assert np.array_equal(image, operator.forward(volume))
     assert np.array_equal(back, operator.adjoint(image))
-
-
-def test_column_is_the_image_of_one_voxel(small, water):
     weights = weights_of(small, water, Grid.centred((4, 3, 2), (0.1, 0.1, 0.1), (0.0, 0.0, -2.0)), (1, 2, 1))
     volume = np.zeros(weights.shape, np.float32)
     volume[1, 2, 3] = 1.0
@@ -112,9 +107,6 @@ def test_column_is_the_image_of_one_voxel(small, water):
     rows, columns, weight = weights.column(1, 2, 3)
     image[rows, columns] = weight
     np.testing.assert_allclose(weights.forward(volume), image, atol=1e-9)
-
-
-def test_no_light_is_lost_inside_the_sensor(small, water):
     operator = factorise(small, water, Grid.centred((3, 3, 5), (0.1, 0.1, 1.0), (0.0, 0.0, 0.0)))
     for axis in (operator.columns, operator.rows):
         sums = np.add.reduceat(axis.share, axis.start[:-1])
@@ -122,7 +114,13 @@ def test_no_light_is_lost_inside_the_sensor(small, water):
 
 
 @pytest.mark.thorough
-def test_one_pitch_in_focus_moves_the_image_by_one_micro_image(table2, water):
+def test_a_point_at_plus_x_lights_the_sensor_at_minus_x_and_one_pitch_moves_it_by_one_micro_image(table2, water):
+    weights = weights_of(table2, water, Grid.centred((1, 1, 1), (0.1, 0.1, 0.1), (2.0, 1.0, 0.0)))
+    rows, columns, weight = weights.column(0, 0, 0)
+    # By hand: x_m = -2 mm, micro-image at -2 (1.004) mm, /5.5 um = -365.1 px from column 1175.5; rows at -182.5 of
+    # 883.5.
+    assert np.sum(weight * columns) / weight.sum() == pytest.approx(1175.5 - 365.1, abs=0.1)
+    assert np.sum(weight * rows) / weight.sum() == pytest.approx(883.5 - 182.5, abs=0.1)
     # Table 2: 0.1 mm (1 + 0.8/200) / 5.5 um = 18.2545 px; M = -1 turns the direction round.
     grid = Grid.centred((3, 1, 1), (0.1, 0.1, 0.1), (0.05, 0.0, 0.0))
     weights = weights_of(table2, water, grid)
@@ -133,44 +131,25 @@ def test_one_pitch_in_focus_moves_the_image_by_one_micro_image(table2, water):
     np.testing.assert_allclose(np.diff(centroids), -18.2545, atol=0.02)
 
 
-@pytest.mark.thorough
-def test_a_point_at_plus_x_lights_the_sensor_at_minus_x(table2, water):
-    weights = weights_of(table2, water, Grid.centred((1, 1, 1), (0.1, 0.1, 0.1), (2.0, 1.0, 0.0)))
-    rows, columns, weight = weights.column(0, 0, 0)
-    # By hand: x_m = -2 mm, micro-image at -2 (1.004) mm, /5.5 um = -365.1 px from column 1175.5; rows at -182.5 of
-    # 883.5.
-    assert np.sum(weight * columns) / weight.sum() == pytest.approx(1175.5 - 365.1, abs=0.1)
-    assert np.sum(weight * rows) / weight.sum() == pytest.approx(883.5 - 182.5, abs=0.1)
-
-
-def test_hexagonal_or_turned_arrays_are_refused(table2, water):
+def test_what_weights_are_made_of(table2, water, small):
+    grid = Grid.centred((10, 10, 100), (0.1, 0.1, 0.1), (0.0, 0.0, 0.0))
+    radius = blur_radius_mm(table2, water, grid)
+    # At z = 5 mm: s_o = 203.76, alpha = -0.0184; 0.231 + 0.05 mm on the array, back to the flow by 1.0188.
+    assert radius == pytest.approx(0.286, abs=0.002)
+    assert default_padding(table2, water, grid) == (3, 3, 0)
     grid = Grid.centred((2, 2, 2), (0.1, 0.1, 0.1), (0.0, 0.0, 0.0))
     for lattice in (Lattice.regular(0.1, "hexagonal"), Lattice.regular(0.1, rotation_rad=1e-3)):
         with pytest.raises(ConfigError, match="does not separate"):
             factorise(replace(table2, lattice=lattice), water, grid)
-
-
-def test_disc_area_below_against_sampling():
+    columns, rows = axis_optics(small)
+    assert (columns.pixels, rows.pixels) == (380, 260)
+    assert (columns.lens_origin_mm, rows.lens_origin_mm) == (0.013, -0.021)
     n = 2000
     x, y = np.meshgrid((np.arange(n) + 0.5) / n * 2 - 1, (np.arange(n) + 0.5) / n * 2 - 1)
     inside = np.hypot(x, y) <= 1.0
     for a, b in [(0.3, -0.5), (-0.8, 0.3), (0.9, 0.9), (-0.5, -0.5), (0.95, -0.2), (0.2, 2.0), (-1.1, 0.0)]:
         counted = np.sum(inside & (x <= a) & (y <= b)) * 4.0 / n**2
         assert disc_area_below(a, b, 1.0) == pytest.approx(counted, abs=4.0 / n)  # one line of cells at each edge
-
-
-def test_padding_reaches_as_far_as_blur(table2, water):
-    grid = Grid.centred((10, 10, 100), (0.1, 0.1, 0.1), (0.0, 0.0, 0.0))
-    radius = blur_radius_mm(table2, water, grid)
-    # At z = 5 mm: s_o = 203.76, alpha = -0.0184; 0.231 + 0.05 mm on the array, back to the flow by 1.0188.
-    assert radius == pytest.approx(0.286, abs=0.002)
-    assert default_padding(table2, water, grid) == (3, 3, 0)
-
-
-def test_axis_optics_reads_both_axes(small):
-    columns, rows = axis_optics(small)
-    assert (columns.pixels, rows.pixels) == (380, 260)
-    assert (columns.lens_origin_mm, rows.lens_origin_mm) == (0.013, -0.021)
 
 
 def test_direct_ray_tracing_gives_the_weights_of_equivalent_points_eqs_14_15(small, water, window):
@@ -196,3 +175,176 @@ def test_exact_refraction_comes_closer_to_exact_rays(small, water, window, z_mm)
         errors.append(np.abs(image - truth).sum())
     assert errors[0] < 0.03
     assert errors[0] < 0.6 * errors[1]
+
+
+VOXEL = (0.1, 0.1, 0.1)
+SMALL = (260, 380)
+
+
+def small_camera(layout: str, rotation_rad: float = 0.0, focal_length_mm: float = 0.8) -> Camera:
+    lattice = Lattice.regular(0.1, layout, rotation_rad, (0.013, -0.021))
+    return Camera(-1.0, 100.0, 25.0, focal_length_mm, 0.8, lattice, 0.0055, SMALL[1], SMALL[0], "x", 1e-4)
+
+
+def quadrature_image(camera, source, centre, voxel=VOXEL, tiles=128):
+    return integrate_columns(camera, source, [centre], voxel, tiles, 5).image(0, SMALL)
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("focal_length_mm", [0.8, 0.7])
+@pytest.mark.parametrize("refraction", ["paraxial", "exact"])
+@pytest.mark.parametrize("rotation_rad", [0.0, 0.02])
+def test_quadrature_agrees_with_counted_rays_eq_13(
+    layout, rotation_rad, refraction, focal_length_mm, water, window, rng
+):
+    camera = small_camera(layout, rotation_rad, focal_length_mm)
+    space = ObjectSpace(water, window, refraction)
+    for centre, voxel in [((0.31, -0.22, 3.0), VOXEL), ((-0.2, 0.1, -4.5), (0.05, 0.05, 0.2))]:
+        exact = quadrature_image(camera, space, centre, voxel)
+        counted = count_rays(camera, space, centre, voxel, rng, RayCount(100_000, 5))
+        # A sum over hundreds of pixels stays within some per cent of its mean; the 5 rays of a point add to it.
+        assert np.abs(exact - counted).sum() < 1.3 * sampling_error(exact, 500_000)
+
+
+def test_halving_the_tiles_converges_in_second_order_and_no_light_is_lost(layout, water, window):
+    camera = small_camera(layout)
+    images = [
+        quadrature_image(camera, ObjectSpace(water, None, "paraxial"), (0.2, 0.1, 2.0), tiles=n) for n in (32, 64, 128)
+    ]
+    coarse, fine = (np.abs(a - b).sum() for a, b in zip(images, images[1:], strict=False))
+    assert fine < 0.4 * coarse
+    assert fine < 0.005
+    for space in (ObjectSpace(water, window, "exact"), ObjectSpace(water, window, "paraxial", "drt")):
+        image = quadrature_image(small_camera(layout), space, (0.0, 0.1, 1.0), tiles=TILES)
+        assert image.sum() == pytest.approx(1.0, abs=1e-4)  # shares below 1e-7 are left out
+
+
+def test_voxels_that_have_no_column_and_counted_rays_that_repeat(table2, water):
+    with pytest.raises(ConfigError, match="needs a window"):
+        ObjectSpace(water, None, "paraxial", "drt").distance(table2, 0.0)
+    space = ObjectSpace(water, Window(198.0, 2.0))
+    with pytest.raises(ConfigError, match="in front of the fluid"):
+        integrate_columns(table2, space, [(0.0, 0.0, -5.0)], VOXEL)
+    columns = integrate_columns(small_camera("square"), ObjectSpace(water, None, "paraxial"), [(9.0, 0.0, 0.0)], VOXEL)
+    assert columns.share.size == 0
+    camera = small_camera("square")
+    images = [
+        count_rays(camera, ObjectSpace(Media()), (0.1, 0.0, 1.0), VOXEL, np.random.default_rng(3), RayCount(50, 40))
+        for _ in range(2)
+    ]
+    assert np.array_equal(*images)
+    assert images[0].sum() == pytest.approx(1.0)
+    space = ObjectSpace(water, None, "paraxial")
+    images = [
+        quadrature_image(c, space, (0.2, -0.1, 1.0), tiles=16) for c in (camera, replace(camera, column_axis="y"))
+    ]
+    assert np.array_equal(*images)
+
+
+def test_tiles_fill_the_disc_and_polynomials_are_their_array_twins(water, rng):
+    tiles = aperture_tiles(12.5, 9)
+    assert tiles.share.sum() == pytest.approx(1.0, rel=1e-12)
+    assert np.hypot(*tiles.middle_mm.T).max() < 12.5
+    # The mean square distance from the axis of a disc is R^2 / 2, of a square about its middle side^2 / 6.
+    spread = np.sum(tiles.share * np.sum(tiles.middle_mm**2, axis=1)) + tiles.side_mm**2 / 6.0
+    assert spread == pytest.approx(12.5**2 / 2.0, rel=5e-3)
+    exponents = complete_exponents(3)
+    fitted = PolynomialRays(np.array([4.0, 3.0, 8.0, 12.0, 11.0]), exponents, rng.normal(size=(len(exponents), 2)))
+    points, crossings = rng.uniform(-4.0, 4.0, (50, 3)), rng.uniform(-12.0, 12.0, (50, 2))
+    scene = kernel_scene(small_camera("square"), fitted, points, np.array(VOXEL), 4, 1)
+    kernel = [
+        on_array(scene, point, rays_from(scene, point, 0, 0), *crossing)
+        for point, crossing in zip(points, crossings, strict=True)
+    ]
+    np.testing.assert_allclose(kernel, fitted.on_array(points, crossings), rtol=1e-12, atol=1e-12)
+    assert fit_vignetting(np.zeros((60, 60), np.float32), Lattice.regular(18.0)) is None
+
+
+def test_lens_regions_share_out_a_rectangle(layout, rng):
+    lattice = Lattice.regular(0.1, layout, 0.1)
+    low, high = np.array([-0.13, 0.02]), np.array([0.11, 0.09])
+    work = np.empty((2, MOST_CORNERS, 2))
+    centres = lattice.points([(i, j) for i in range(-4, 5) for j in range(-4, 5)])
+    parts = [
+        shared_rectangle((low[0], low[1]), (high[0], high[1]), x, y, neighbours(lattice), work) for x, y in centres
+    ]
+    area = float(np.prod(high - low))
+    assert sum(part[0] for part in parts) == pytest.approx(area, rel=1e-12)
+    points = low + rng.random((20_000, 2)) * (high - low)
+    nearest = lattice.points(lattice.nearest(points))
+    for centre, part in zip(centres, parts, strict=True):
+        inside = np.all(np.abs(nearest - centre) < 1e-9, axis=1)
+        assert part[0] / area == pytest.approx(inside.mean(), abs=0.015)  # four standard errors
+        if inside.sum() > 1000:
+            np.testing.assert_allclose(part[1:3], points[inside].mean(axis=0), atol=0.003)
+
+
+@pytest.mark.parametrize("z_mm", [0.5, 3.0])
+def test_fitted_rays_give_the_columns_of_traced_ones(layout, water, z_mm):
+    # At one depth paraxial rays are linear: x_m = alpha X - x s_i/s_o; a flat voxel sees no other depth.
+    camera = replace(small_camera(layout), distortion_per_mm2=0.0)
+    space = ObjectSpace(water, None, "paraxial")
+    distance = float(space.distance(camera, z_mm))
+    alpha, scale = float(camera.defocus(distance)), camera.image_distance_mm / distance
+    exponents = np.array([(1, 0, 0, 0, 0), (0, 0, 0, 1, 0), (0, 1, 0, 0, 0), (0, 0, 0, 0, 1)], np.int64)
+    units = np.array([2.0, 3.0, 5.0, 10.0, 12.5])
+    along = np.array([-scale * units[0], alpha * units[3], 0.0, 0.0])
+    across = np.array([0.0, 0.0, -scale * units[1], alpha * units[4]])
+    fitted = PolynomialRays(units, exponents, np.stack([along, across], axis=1))
+    images = [quadrature_image(camera, each, (0.2, -0.1, z_mm), (0.1, 0.1, 1e-9), 24) for each in (space, fitted)]
+    np.testing.assert_allclose(*images, atol=1e-9)
+    assert images[0].sum() == pytest.approx(1.0, abs=1e-4)
+
+
+@pytest.mark.parametrize(("degree", "terms"), [(2, 21), (3, 56)])
+def test_complete_polynomials_have_the_terms_of_hall_et_al(degree, terms):
+    exponents = complete_exponents(degree)
+    assert exponents.shape == (terms, 5)
+    assert len(np.unique(exponents, axis=0)) == terms
+
+
+SHAPE = (520, 760)
+
+
+@pytest.fixture
+def wide_camera(table2, layout):
+    return replace(table2, rows=SHAPE[0], columns=SHAPE[1], lattice=Lattice.regular(0.1, layout))
+
+
+def shading() -> np.ndarray:
+    """cos^4 of a steep lens, 0.6 in the corners."""
+    y, x = np.meshgrid(*((np.arange(n) - n / 2) / (n / 2) for n in SHAPE), indexing="ij")
+    return 1.0 / (1.0 + 0.145 * (x**2 + y**2)) ** 2
+
+
+@pytest.mark.thorough
+def test_vignetting_is_found_under_the_rims_of_the_lens_images(wide_camera):
+    white = render_white(wide_camera, 1000.0) * shading()
+    lattice = wide_camera.micro_image_lattice_px()
+    coefficients = fit_vignetting(relative_transmission(white.astype(np.float32), lattice), lattice)
+    surface = vignetting_surface(coefficients, SHAPE)
+    np.testing.assert_allclose(surface, shading(), atol=0.01)
+
+
+@pytest.mark.parametrize("pitch_mm", [0.055, 0.1])
+def test_even_light_on_a_small_sensor_stays_even_up_to_its_border(pitch_mm, table2, layout, rng):
+    camera = replace(table2, rows=180, columns=210, lattice=Lattice.regular(pitch_mm, layout))
+    lattice = camera.micro_image_lattice_px()
+    white = rng.poisson(render_white(camera, 400.0)).astype(np.float32)
+    coefficients = fit_vignetting(relative_transmission(white, lattice), lattice)
+    # Medians of some twenty pixels with a twentieth of noise each, and some six times their error in the corners.
+    np.testing.assert_allclose(vignetting_surface(coefficients, (180, 210)), 1.0, atol=0.09)
+
+
+@pytest.mark.thorough
+def test_weights_behind_a_transmission_scale_their_pixels(table2, water, rng):
+    camera = replace(table2, rows=260, columns=380)
+    grid = Grid.centred((3, 3, 2), (0.1, 0.1, 0.5), (0.1, 0.0, 1.0))
+    transmission = rng.random((260, 380), dtype=np.float32)
+    on_demand = OnDemandOperator(camera, ObjectSpace(water, None, "paraxial"), grid)
+    volume = rng.random(grid.shape_zyx, dtype=np.float32)
+    for operator in (factorise(camera, water, grid), on_demand, on_demand.restricted(np.ones((260, 380), np.float32))):
+        dimmed = operator.behind(transmission)
+        np.testing.assert_allclose(dimmed.forward(volume), operator.forward(volume) * transmission, atol=1e-6)
+        image = rng.random((260, 380), dtype=np.float32)
+        np.testing.assert_allclose(dimmed.adjoint(image), operator.adjoint(image * transmission), rtol=1e-5)

@@ -1,16 +1,19 @@
-"""Weights that somebody has edited: refused with what is wrong, before anything large is made."""
+"""Weights that somebody has edited, and arguments that do not fit them: refused with what is wrong."""
 
-from __future__ import annotations
-
+import multiprocessing
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import h5py
+import numba
 import numpy as np
 import pytest
 import yaml
 
+from lfpiv_cli.errors import InputError, UsageError
+from lfpiv_cli.files.weights_file import WeightsFile, open_weights
 from tests.hostile_files import edited, ended
 
 ROOT = Path(__file__).parent.parent
@@ -19,42 +22,45 @@ ROOT = Path(__file__).parent.parent
 SAMPLE = ROOT / "sample_data"
 
 
+def built(folder: Path, *options: object, layout: str = "square", padding: int = 0, **volume: object) -> Path:
+    """Return weights of a few voxels of the sample."""
+    config = yaml.safe_load((ROOT / "configs" / "sample.yaml").read_text())
+    config["volume"] |= {"shape_xyz": [3, 2, 2]} | volume
+    config["camera"]["microlenses"]["layout"] = layout
+    config["reconstruction"]["padding_voxel"] = [padding, padding, 0]
+    (folder / "rig.yaml").write_text(yaml.safe_dump(config))
+    assert ended("build-weights", folder / "rig.yaml", *options, "-o", folder / "w.h5") == (0, "")
+    return folder / "w.h5"
+
+
 @pytest.fixture(scope="module")
 def weights(tmp_path_factory: pytest.TempPathFactory) -> bytes:
-    """The bytes of factorised weights of a few voxels."""
-    folder = tmp_path_factory.mktemp("weights")
-    config = yaml.safe_load((ROOT / "configs" / "sample.yaml").read_text())
-    config["volume"] |= {"shape_xyz": [3, 2, 2], "reference": "focal_point"}
-    config["reconstruction"]["padding_voxel"] = [0, 0, 0]
-    (folder / "rig.yaml").write_text(yaml.safe_dump(config))
-    assert ended("build-weights", folder / "rig.yaml", "-o", folder / "w.h5") == (0, "")
-    return (folder / "w.h5").read_bytes()
+    """The bytes of factorised weights."""
+    return built(tmp_path_factory.mktemp("weights"), reference="focal_point").read_bytes()
 
 
 @pytest.fixture(scope="module")
 def calibrated(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[bytes, tuple[object, ...]]]:
     """The bytes of a calibration, and of weights made with it, each with the command that takes it as {file}."""
     folder = tmp_path_factory.mktemp("calibrated")
-    config = yaml.safe_load((ROOT / "configs" / "sample.yaml").read_text())
-    config["volume"] |= {"shape_xyz": [3, 2, 2]}
-    config["reconstruction"]["padding_voxel"] = [0, 0, 0]
     rig, calibration = folder / "rig.yaml", folder / "c.h5"
-    rig.write_text(yaml.safe_dump(config))
+    built(folder, reference="focal_point")
+    rig.write_text(rig.read_text().replace("focal_point", "mid_plane"))
     pictures = ("--white", SAMPLE / "white.tif", "--board", SAMPLE / "board.tif")
     assert ended("calibrate-snapshot", rig, *pictures, "-o", calibration) == (0, "")
-    assert ended("build-weights", rig, "--calibration", calibration, "-o", folder / "w.h5") == (0, "")
+    weights = built(folder, "--calibration", calibration, "--overwrite").read_bytes()
     build = ("build-weights", rig, "--calibration", "{file}", "-o", "{folder}/out.h5")
     use = ("reconstruct", "{file}", SAMPLE / "pair_a.tif", "--iterations", 1, "-o", "{folder}/out.vtkhdf")
-    return {"calibration": (calibration.read_bytes(), build), "weights": ((folder / "w.h5").read_bytes(), use)}
+    return {"calibration": (calibration.read_bytes(), build), "weights": (weights, use)}
 
 
 def put(file: h5py.File, name: str, value: Any) -> None:
-    """Put another value in the place of an array (`group/name`) or an attribute (`group@name`)."""
+    """Put another value in the place of an array (`group/name`), if there is one, or an attribute (`group@name`)."""
     if "@" in name:
         group, attribute = name.split("@")
         file[group].attrs[attribute] = value
     else:
-        del file[name]
+        file.pop(name, None)
         file[name] = value
 
 
@@ -112,8 +118,7 @@ def wrong(weights: bytes, folder: Path, edit: Callable[[h5py.File], object]) -> 
     path.write_bytes(weights)
     with edited(path) as file:
         edit(file)
-    image = ROOT / "sample_data" / "pair_a.tif"
-    return ended("reconstruct", path, image, "--iterations", 1, "-q", "-o", folder / "v.vtkhdf")
+    return ended("reconstruct", path, SAMPLE / "pair_a.tif", "--iterations", 1, "-q", "-o", folder / "v.vtkhdf")
 
 
 @pytest.mark.thorough
@@ -128,30 +133,20 @@ def test_an_edit_that_cannot_be_is_named(tmp_path: Path, weights: bytes, name: s
 @pytest.mark.thorough
 @pytest.mark.parametrize("name", ["camera", "grid", "columns", "rows", "columns/share", "grid/spacing_mm"])
 def test_what_is_missing_or_of_another_kind_is_named(tmp_path: Path, weights: bytes, name: str) -> None:
-    assert wrong(weights, tmp_path, lambda file: file.__delitem__(name))[0] == 4
-    assert wrong(weights, tmp_path, lambda file: put(file, name, [1.0, 2.0]))[0] == 4
-    assert wrong(weights, tmp_path, lambda file: (file.__delitem__(name), file.create_group(name)))[0] == 4
+    for put_in_place in (lambda file: None, lambda file: put(file, name, [1.0]), lambda file: file.create_group(name)):
+        edit = lambda file, then=put_in_place: (file.__delitem__(name), then(file))  # noqa: E731
+        assert wrong(weights, tmp_path, edit)[0] == 4
 
 
-def test_weights_of_an_earlier_version_are_to_be_built_again(tmp_path: Path, weights: bytes) -> None:
+def test_tracing_through_what_cannot_be_and_an_earlier_version_are_named(tmp_path: Path, weights: WeightsFile) -> None:
+    for media in ((0.5, 1.0, 1.0), (1.0, np.nan, 1.0), (1.0, 1.0, 1e300)):
+        told = dict(zip(("air", "window", "fluid"), media, strict=True))
+        told |= {"method": np.bytes_("ert"), "refraction": np.bytes_("exact")}
+        code, said = wrong(weights, tmp_path, lambda file, told=told: file.create_group("on_demand").attrs.update(told))
+        assert (code, "not a whole weights file" in said) == (4, True)
     code, said = wrong(weights, tmp_path, lambda file: file.attrs.__setitem__("format_version", 3))
     assert code == 4
     assert "w.h5: has lfpiv-weights version 3, this program reads 4; make it again with this program" in said
-
-
-@pytest.mark.parametrize("media", [(0.5, 1.0, 1.0), (1.0, np.nan, 1.0), (1.0, 1.0, 1e300)])
-def test_tracing_through_what_cannot_be_is_named(
-    tmp_path: Path, weights: bytes, media: tuple[float, float, float]
-) -> None:
-    def trace(file: h5py.File) -> None:
-        group = file.create_group("on_demand")
-        told = dict(zip(("air", "window", "fluid"), media, strict=True))
-        for name, value in (told | {"method": np.bytes_("ert"), "refraction": np.bytes_("exact")}).items():
-            group.attrs[name] = value
-
-    code, said = wrong(weights, tmp_path, trace)
-    assert code == 4
-    assert "not a whole weights file" in said
 
 
 @pytest.mark.thorough
@@ -165,12 +160,6 @@ def test_shares_whose_sums_have_no_inverse_are_named(tmp_path: Path, weights: by
     assert (code, "w.h5: not a whole weights file: the largest weight is" in said) == (4, True), said
 
 
-def grouped(file: h5py.File, name: str) -> None:
-    """Put a group in the place of an array."""
-    del file[name]
-    file.create_group(name).create_dataset("part", data=np.ones(3))
-
-
 # In a calibration, and by what; in that of weights they lie in the group `calibration`.
 CALIBRATION_EDITS: list[tuple[str, Callable[[h5py.File, str], object]]] = [
     ("image_shape", lambda file, name: put(file, name, [10, 10])),
@@ -178,7 +167,10 @@ CALIBRATION_EDITS: list[tuple[str, Callable[[h5py.File, str], object]]] = [
         (name, lambda file, name: put(file, name, 0.5))
         for name in ("transmission", "lattice/basis_px", "board/dots_mm")
     ),
-    *((name, grouped) for name in ("transmission", "lattice/centres_px")),
+    *(
+        (name, lambda file, name: (file.__delitem__(name), file.create_dataset(f"{name}/part", data=np.ones(3))))
+        for name in ("transmission", "lattice/centres_px")
+    ),
     ("transmission", lambda file, name: file[name].__setitem__((3, 4), np.nan)),
 ]
 
@@ -201,3 +193,57 @@ def test_a_calibration_with_other_shapes_is_refused(
     code, said = ended(*(str(word).format(file=path, folder=tmp_path) for word in command))
     assert (code, "file.h5: " in said, "calibration" in said) == (4, True, True), said
     assert [path.name] == [each.name for each in tmp_path.iterdir()]
+
+
+@pytest.fixture(scope="module", params=["square", "hexagonal"])
+def opened(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> WeightsFile:
+    """Factorised weights with padding, and those on demand without."""
+    padding, folder = 2 if request.param == "square" else 0, tmp_path_factory.mktemp("weights")
+    volume = {"shape_xyz": [4, 3, 2], "reference": "focal_point"}
+    return open_weights(built(folder, layout=request.param, padding=padding, **volume))
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("shape", [(), (600,), (448, 1), (447, 600), (448, 601), (600, 448), (1, 448, 600)])
+def test_images_of_another_shape_are_refused(opened: WeightsFile, shape: tuple[int, ...]) -> None:
+    for adjoint in (opened.adjoint, opened.weights.solver_operator.adjoint):
+        with pytest.raises(InputError, match="does not fit weights made for"):
+            adjoint(np.ones(shape, np.float32))
+
+
+@pytest.mark.parametrize("shape", [(), (4,), (3, 4), (1, 3, 4), (2, 3, 5), (4, 3, 2), (1, 2, 3, 4)])
+def test_volumes_of_another_shape_are_not_stretched(opened: WeightsFile, shape: tuple[int, ...]) -> None:
+    for forward in (opened.forward, opened.weights.solver_operator.forward):
+        with pytest.raises(InputError, match="does not fit weights made for"):
+            forward(np.ones(shape, np.float32))
+
+
+def test_what_is_no_real_number_and_voxels_outside_the_volume_are_refused(opened: WeightsFile) -> None:
+    for verb, shape in ((opened.forward, opened.shape), (opened.adjoint, opened.image_shape)):
+        for wrong in (*(np.zeros(shape, kind) for kind in (complex, object, "U1")), None):
+            with pytest.raises(InputError, match="expected real numbers"):
+                verb(wrong)
+    with pytest.raises(InputError, match="expected real numbers"):
+        opened.prepare(np.zeros(opened.image_shape, complex))
+    for index in ((-1, 0, 0), (0, -1, 0), (0, 0, -1), (2, 0, 0), (0, 3, 0), (0, 0, 4)):
+        with pytest.raises(IndexError, match="outside a volume"):
+            opened.column(*index)
+    with pytest.raises(TypeError):
+        opened.column(0.5, 0, 0)
+    # Lists of whole numbers are taken.
+    volume = np.ones(opened.shape, np.int64)
+    np.testing.assert_array_equal(opened.forward(volume.tolist()), opened.forward(volume.astype(np.float32)))
+
+
+@pytest.mark.thorough
+@pytest.mark.skipif(sys.platform != "linux", reason="workers are not forked")
+def test_a_forked_worker_says_that_it_has_lost_its_threads(tmp_path: Path) -> None:
+    found = open_weights(built(tmp_path, reference="focal_point"))
+    volume = np.ones(found.shape, np.float32)
+    found.forward(volume)
+    if numba.threading_layer() != "omp":
+        pytest.skip("these threads outlive a fork, or begin anew")
+    with multiprocessing.get_context("fork").Pool(1) as pool:
+        waiting = pool.apply_async(found.forward, [volume])
+        with pytest.raises(UsageError, match="spawn"):
+            waiting.get(10.0)

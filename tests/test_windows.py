@@ -1,0 +1,383 @@
+"""Windows: their sums written out, weighted or not; outliers among vectors, and the mean of a batch."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from benchmarks.volumes import Seeding, volume_pair
+from lfpiv_cli.errors import ConfigError, InputError
+from lfpiv_cli.files.config import load_config
+from lfpiv_cli.flow.correlation import Coarse, correlate, plan
+from lfpiv_cli.flow.deformation import MOST_TAPS, NEIGHBOURS, gather_taps, interpolate
+from lfpiv_cli.flow.field import MASKED, REJECTED, REPLACED, SECOND_PEAK, VALID, VectorField, statistics_of
+from lfpiv_cli.flow.moments import MOMENTS, gauss_newton, pair_moments
+from lfpiv_cli.flow.outliers import EXPECTED_NOISE_VOXEL, expected_noise, fill_field, predict, validate_vectors
+from lfpiv_cli.flow.sums import map_sums, margins
+from lfpiv_cli.flow.windows import WEIGHTINGS, CorrelationSettings, WindowLayout, cells_of, layout_windows
+from lfpiv_cli.grid import Grid
+from lfpiv_cli.names import Weighting, names_in
+from lfpiv_cli.verbs.correlate import CorrelateOptions
+
+
+def spline(s: np.ndarray) -> np.ndarray:
+    """Return the cubic B-spline."""
+    outer, inner = (np.maximum(0.0, reach - np.abs(s)) ** 3 for reach in (2.0, 1.0))
+    return (outer - 4.0 * inner) / 6.0
+
+
+@pytest.mark.parametrize(("spread", "fewer"), [((0.2, 0.7), False), ((-1.9, 2.0), False), ((-4.0, 4.0), True)])
+def test_interpolation_sums_b_splines_at_mirrored_places(
+    spread: tuple[float, float], fewer: bool, rng: np.random.Generator
+) -> None:
+    a, b = rng.standard_normal((2, 19 * 21 * 80), np.float32)
+    moved = rng.uniform(*spread, (3, 3 * NEIGHBOURS)).astype(np.float32)
+    weights, sums = np.zeros((3, MOST_TAPS * NEIGHBOURS), np.float32), np.zeros((2, NEIGHBOURS), np.float32)
+    width, taps = gather_taps(moved, 5, weights)
+    assert (width < NEIGHBOURS) == fewer
+    at, plane, row = 9 * 21 * 80 + 10 * 80 + 30, 21 * 80, 80
+    interpolate(sums, (a, b), (at, plane, row), weights, taps)
+    steps = np.arange(-6, 7)
+    away = steps[:, None, None] * plane + steps[:, None] * row + steps
+    for k in range(width):
+        x, y, z = (spline(steps - float(moved[axis, 5 + k])) for axis in range(3))
+        share = z[:, None, None] * y[:, None] * x
+        # float32 sums of up to 512 terms; taps that weigh less than 2e-7 are left out
+        assert sums[0, k] == pytest.approx(np.sum(share * a[at + k - away]), abs=1e-5)
+        assert sums[1, k] == pytest.approx(np.sum(share * b[at + k + away]), abs=1e-5)
+
+
+@pytest.mark.parametrize("radius", [1, 2, 4])
+def test_products_are_summed_over_windows_for_every_shift(radius: int, rng: np.random.Generator) -> None:
+    a, b = rng.standard_normal((2, 5, 6, 80), np.float32)
+    layout = layout_windows((80, 6, 5), (70, 4, 3), (0.5, 0.5, 0.5))
+    before, after = margins(layout, a.shape, radius)
+    padded_a, padded_b = (np.pad(one, list(zip(before, after, strict=True))) for one in (a, b))
+    sums = map_sums(padded_a, padded_b, layout, before, radius)
+    places = rng.integers(0, 2 * radius + 1, (20, 3))
+    first = np.add(before, layout.first[::-1])
+    here = tuple(slice(low, low + size) for low, size in zip(first, layout.size[::-1], strict=True))
+    assert sums.blocks.per_window[:2] == (1, 1)
+    for place in places:
+        shift = place - radius
+        there, back = (
+            tuple(slice(s.start + k, s.stop + k) for s, k in zip(here, sign * shift, strict=True)) for sign in (1, -1)
+        )
+        wide_a, wide_b = padded_a.astype(np.float64), padded_b.astype(np.float64)
+        expected = np.sum(wide_a[here] * wide_b[there] + wide_a[back] * wide_b[here])
+        assert sums.products[0, 0, 0][tuple(place)] == pytest.approx(expected, abs=2e-4)
+
+
+def test_moments_are_those_of_gradient_mean_and_difference(rng: np.random.Generator) -> None:
+    a, b = rng.standard_normal((2, 6, 7, 12), np.float32)
+    valid = (rng.random(a.shape) < 0.95).astype(np.uint8)
+    layout = layout_windows((10, 5, 4), (10, 5, 4), (0.0, 0.0, 0.0))
+    found = pair_moments(a, b, valid, layout, (1, 1, 1)).sum(axis=(0, 1, 2))
+    wide_a, wide_b = a.astype(np.float64), b.astype(np.float64)
+    inner = (slice(1, -1),) * 3
+    gradients = [0.5 * (np.roll(wide_a + wide_b, -1, k) - np.roll(wide_a + wide_b, 1, k)) / 2.0 for k in (2, 1, 0)]
+    slopes = [0.25 * (np.roll(wide_b - wide_a, -1, k) - np.roll(wide_b - wide_a, 1, k)) for k in (2, 1, 0)]
+    kept = valid.copy()
+    for k in range(3):
+        kept &= np.roll(valid, 1, k) & np.roll(valid, -1, k)
+    q, r = [*gradients, 0.5 * (wide_a + wide_b)], wide_b - wide_a
+    pairs = [(q[i], q[j]) for i in range(4) for j in range(i, 4)] + [(one, r) for one in q] + [(s, s) for s in slopes]
+    expected = [np.sum((one * other * kept)[inner]) for one, other in pairs]
+    assert len(expected) == MOMENTS
+    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-4)
+
+
+HALF = (0.5, 0.5, 0.5)
+TABLE2 = Path(__file__).parents[1] / "configs" / "table2.yaml"
+# An odd size, shared and unshared cells, windows that overhang and leave gaps.
+LAYOUTS = [((8, 7, 6), HALF), ((8, 8, 8), HALF), ((9, 6, 4), (0.75, 0.0, 0.5))]
+
+
+def layout_of(size: tuple[int, int, int], overlap: tuple[float, float, float]) -> WindowLayout:
+    return replace(layout_windows((22, 20, 18), size, overlap), weighting="gaussian")
+
+
+def weights_in(layout: WindowLayout) -> NDArray[np.float64]:
+    """The weights [z, y, x] of a window's voxels, by the definition: a Gaussian of a quarter of the size."""
+    axes = [(np.arange(n) - 0.5 * (n - 1)) / n for n in layout.size[::-1]]
+    z, y, x = np.meshgrid(*axes, indexing="ij")
+    return np.exp(-0.5 * (x**2 + y**2 + z**2) / 0.25**2)
+
+
+def window(volume: NDArray, layout: WindowLayout, index: tuple[int, ...], begin: tuple[int, ...]) -> NDArray:
+    """The voxels of a window in a volume whose first voxel has the index `begin` less."""
+    places = zip(layout.first[::-1], layout.step[::-1], layout.size[::-1], index, begin, strict=True)
+    return volume[tuple(slice(f + k * s + b, f + k * s + b + n) for f, s, n, k, b in places)].astype(np.float64)
+
+
+def test_the_registry_has_the_names_that_config_and_option_choose() -> None:
+    assert tuple(WEIGHTINGS) == names_in(Weighting)
+    with pytest.raises(ConfigError, match="weighting of the windows is round"):
+        CorrelationSettings([(8, 8, 8)], HALF, weighting="round").layout((16, 16, 16))
+    config, voxel_mm = load_config(TABLE2), (0.1, 0.1, 0.1)
+    assert config.correlation_settings(voxel_mm).weighting == "uniform"
+    chosen = config.overridden_by("correlation", CorrelateOptions(weighting="gaussian")).correlation_settings(voxel_mm)
+    assert {step.layout.weighting for step in plan((100, 100, 100), chosen)} == {"gaussian"}
+    assert Coarse.over((100, 100, 100), chosen).layout.weighting == "gaussian"
+
+
+@pytest.mark.parametrize(("size", "overlap"), LAYOUTS)
+def test_maps_are_the_weighted_correlation(
+    size: tuple[int, int, int], overlap: tuple[float, float, float], rng: np.random.Generator
+) -> None:
+    layout, radius = layout_of(size, overlap), 1
+    a, b = rng.random((2, 18, 20, 22)).astype(np.float32)
+    before, after = margins(layout, a.shape, radius)
+    padded_a, padded_b = (np.pad(volume, list(zip(before, after, strict=True))) for volume in (a, b))
+    maps = map_sums(padded_a, padded_b, layout, before, radius).correlation()
+    weights = weights_in(layout)
+    for index in [(0, 0, 0), (1, 1, 0), tuple(n - 1 for n in layout.count[::-1])]:
+        for shift in np.ndindex(3, 3, 3):
+            there, back = (
+                tuple(m + sign * (s - radius) for m, s in zip(before, shift, strict=True)) for sign in (1, -1)
+            )
+            still_a, still_b = (window(volume, layout, index, before) for volume in (padded_a, padded_b))
+            moved_a, moved_b = window(padded_a, layout, index, back), window(padded_b, layout, index, there)
+            products = np.sum(weights * (still_a * moved_b + moved_a * still_b))
+            energies = [
+                np.sum(weights * (still**2 + moved**2)) for still, moved in ((still_a, moved_a), (still_b, moved_b))
+            ]
+            assert maps[index][shift] == pytest.approx(products / np.sqrt(np.prod(energies)), rel=1e-5)
+
+
+@pytest.mark.parametrize(("size", "overlap"), LAYOUTS)
+def test_moments_are_weighted_sums_of_those_of_single_voxels(
+    size: tuple[int, int, int], overlap: tuple[float, float, float], rng: np.random.Generator
+) -> None:
+    layout, single = layout_of(size, overlap), layout_windows((22, 20, 18), (1, 1, 1), (0.0, 0.0, 0.0))
+    a, b = rng.random((2, 18, 20, 22)).astype(np.float32)
+    valid = (rng.random(a.shape) < 0.97).astype(np.uint8)
+    before, after = margins(layout, a.shape, 1)
+    padded = [np.pad(volume, list(zip(before, after, strict=True))) for volume in (a, b, valid)]
+    found, cells = pair_moments(*padded, layout, before), cells_of(layout)
+    margin = [(m, n) for m, n in zip(before, after, strict=True)]
+    of_voxels = np.pad(pair_moments(*padded, single, before), [*margin, (0, 0)])
+    parts, weights = cells.per_window, weights_in(layout)[..., np.newaxis]
+    for index in np.ndindex(2, 2, 2):
+        own = found[tuple(slice(k * n, (k + 1) * n) for k, n in zip(index, parts, strict=True))]
+        expected = np.sum(weights * window(of_voxels, layout, index, before), axis=(0, 1, 2))
+        np.testing.assert_allclose(own.sum(axis=(0, 1, 2)), expected, rtol=1e-4, atol=1e-5)
+
+
+def test_a_weighted_step_is_the_weighted_least_squares_solution(rng: np.random.Generator) -> None:
+    a, b = volume_pair(
+        lambda points: np.tile((0.1, -0.2, 0.3), (len(points), 1)), (32, 40, 36), Seeding(12.0, (1.2, 1.2, 2.0)), rng
+    )
+    layout = replace(layout_windows((32, 40, 36), (16, 16, 16), HALF), weighting="gaussian")
+    before, after = margins(layout, a.shape, 1)
+    padded = (np.pad(each, list(zip(before, after, strict=True))) for each in (a, b, np.ones(a.shape, np.uint8)))
+    found = gauss_newton(pair_moments(*padded, layout, before), layout, np.ones(3))[0]
+    mean, inside = 0.5 * (a.astype(float) + b), (0, 0, 0)
+    basis = [window(g, layout, (1, 1, 1), inside).ravel() for g in [*np.gradient(mean)[::-1], mean]]
+    root = np.sqrt(weights_in(layout)).ravel()
+    right = root * window(b.astype(float) - a, layout, (1, 1, 1), inside).ravel()
+    expected = -np.linalg.lstsq(root[:, np.newaxis] * np.stack(basis, axis=1), right, rcond=None)[0][:3]
+    np.testing.assert_allclose(found[1, 1, 1], expected, atol=1e-4)
+
+
+def measured(flow, weighting: str, rng: np.random.Generator, noise: float = 0.0) -> VectorField:
+    """Vectors in a cube of 48 voxels, windows of 16."""
+    a, b = volume_pair(flow, (48, 48, 48), Seeding(12.0, (1.0, 1.0, 1.0), noise), rng)
+    grid = Grid((48, 48, 48), (1.0, 1.0, 1.0), (0.0, 0.0, 0.0))
+    return correlate([(a, b)], grid, CorrelationSettings([(16, 16, 16)], HALF, weighting=weighting))
+
+
+@pytest.mark.thorough
+def test_one_displacement_is_found_without_bias_and_its_errors_are_stated(rng: np.random.Generator) -> None:
+    shift = np.array((1.3, -0.6, 0.4))
+    field = measured(lambda points: np.tile(shift, (len(points), 1)), "gaussian", rng, noise=0.1)
+    inner = (slice(1, -1),) * 3
+    error = (field.displacement_voxel - shift)[inner]
+    assert field.uncertainty_voxel is not None
+    stated = field.uncertainty_voxel[inner]
+    # 64 windows, each voxel of which counts in eight of them.
+    assert np.all(np.abs(error.mean(axis=(0, 1, 2))) < 4.0 * np.sqrt(np.mean(error**2, axis=(0, 1, 2)) / 8.0))
+    ratio = np.sqrt(np.mean(error**2, axis=(0, 1, 2)) / np.mean(stated**2, axis=(0, 1, 2)))
+    assert np.all((ratio > 0.4) & (ratio < 1.5))
+
+
+@pytest.mark.thorough
+def test_a_curved_shear_loses_less_than_in_uniform_windows(rng: np.random.Generator) -> None:
+    def wave(points: NDArray[np.float64]) -> NDArray[np.float64]:
+        moved = np.zeros(points.shape)
+        moved[:, 0] = 0.8 * np.sin(2.0 * np.pi * points[:, 1] / 32.0)
+        return moved
+
+    kept = []
+    for weighting in names_in(Weighting):
+        field = measured(wave, weighting, np.random.default_rng(5))
+        centres = field.grid.centres_mm()
+        truth = wave(centres.reshape(-1, 3)).reshape(centres.shape)[1:-1, 1:-1, 1:-1, 0]
+        found = field.displacement_raw_voxel[1:-1, 1:-1, 1:-1, 0]
+        kept.append(np.sum(found * truth) / np.sum(truth**2))
+    uniform, gaussian = kept
+    assert uniform < gaussian < 1.02
+    assert 1.0 - gaussian < 0.8 * (1.0 - uniform)
+
+
+FIELD_SHAPE = (12, 16, 12)
+NOISE = np.full(3, EXPECTED_NOISE_VOXEL)
+
+
+def indices() -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    z, y, x = np.meshgrid(*(np.arange(n, dtype=np.float64) for n in FIELD_SHAPE), indexing="ij")
+    return x, y, z
+
+
+def linear_field() -> NDArray[np.float64]:
+    x, y, z = indices()
+    return np.stack([0.7 * y - 0.3 * z, 0.5 * x, 0.2 * x - 0.4 * y + 0.1 * z], axis=-1)
+
+
+def channel_field() -> NDArray[np.float64]:
+    """The parabola of the paper's channel: 4 voxels at its middle, nothing at the walls; flow along y."""
+    x, _, z = indices()
+    profile = 4.0 * (1.0 - ((x - 5.5) / 6.0) ** 2) * (1.0 - ((z - 5.5) / 6.0) ** 2)
+    return np.stack([np.zeros(FIELD_SHAPE), profile, np.zeros(FIELD_SHAPE)], axis=-1)
+
+
+def validated(
+    raw: NDArray[np.float64], second: NDArray[np.float64] | None = None
+) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
+    """Validate a field whose NaN are windows without a peak."""
+    measured = np.isfinite(raw).all(axis=-1)
+    nowhere = np.zeros(raw.shape[:3], dtype=np.bool_)
+    return validate_vectors(raw, np.full(raw.shape, np.nan) if second is None else second, measured, nowhere, NOISE)
+
+
+@pytest.mark.parametrize("field", [linear_field(), channel_field()], ids=["linear", "channel"])
+def test_clean_shear_raises_no_false_alarm(field: NDArray[np.float64], rng: np.random.Generator) -> None:
+    noisy = field + rng.normal(0.0, 0.06, field.shape)
+    displacement, flag = validated(noisy)
+    assert np.all(flag == VALID)
+    np.testing.assert_array_equal(displacement, noisy)
+
+
+@pytest.mark.parametrize("component", [0, 1, 2])
+def test_scattered_outliers_are_found_and_replaced(component: int, rng: np.random.Generator) -> None:
+    truth = channel_field()
+    wrong = rng.random(FIELD_SHAPE) < 0.05
+    raw = truth + rng.normal(0.0, 0.02, truth.shape)
+    raw[wrong, component] += 2.0
+    displacement, flag = validated(raw)
+    np.testing.assert_array_equal(flag == REPLACED, wrong)
+    # The neighbours' parabola bends by up to 0.2 voxel between two windows.
+    assert np.max(np.abs(displacement - truth)) < 0.3
+
+
+def test_outliers_are_replaced_but_not_masked_vectors() -> None:
+    truth = linear_field()
+    raw = truth.copy()
+    for place in ((0, 0, 0), (11, 15, 11), (0, 7, 5), (6, 0, 11), (5, 5, 5)):
+        raw[place] += (3.0, -2.0, 5.0)
+    displacement, flag = validated(raw)
+    assert np.sum(flag == REPLACED) == 5
+    np.testing.assert_allclose(displacement, truth, atol=1e-12)
+    raw, second = truth.copy(), np.full(truth.shape, np.nan)
+    raw[4, 4, 4] += 3.0
+    second[4, 4, 4] = truth[4, 4, 4] + 0.05
+    raw[8, 8, 8] += 3.0
+    second[8, 8, 8] = truth[8, 8, 8] - 3.0
+    displacement, flag = validated(raw, second)
+    assert (flag[4, 4, 4], flag[8, 8, 8]) == (SECOND_PEAK, REPLACED)
+    np.testing.assert_array_equal(displacement[4, 4, 4], second[4, 4, 4])
+    # Windows without a peak are rejected.
+    raw = truth.copy()
+    raw[3, 3, 3] = np.nan
+    raw[:, :, 8:] = np.nan
+    displacement, flag = validated(raw)
+    np.testing.assert_array_equal(flag == REJECTED, np.isnan(raw).any(axis=-1))
+    np.testing.assert_array_equal(np.isnan(displacement).any(axis=-1), flag >= REJECTED)
+    # Filling goes on with the flow, and of nothing makes nothing.
+    holed = truth.copy()
+    holed[4:7, 4:7, 4:7] = np.nan
+    np.testing.assert_allclose(fill_field(holed), truth, atol=1e-9)
+    assert np.all(fill_field(np.full((3, 3, 3, 3), np.nan)) == 0.0)
+    raw = truth.copy()
+    masked = np.zeros(FIELD_SHAPE, dtype=np.bool_)
+    masked[:, :, 6:] = True
+    raw[masked] = 50.0
+    raw[5, 5, 5] += 2.0
+    everywhere = np.ones(FIELD_SHAPE, dtype=np.bool_)
+    displacement, flag = validate_vectors(raw, np.full(raw.shape, np.nan), everywhere, masked, NOISE)
+    assert np.all(flag[masked] == MASKED)
+    assert flag[5, 5, 5] == REPLACED
+    np.testing.assert_allclose(displacement[5, 5, 5], truth[5, 5, 5], atol=1e-12)
+    assert np.all(flag[~masked] <= REPLACED)
+    assert np.sum(flag[~masked] == REPLACED) == 1
+    width = np.full((2, 2, 2, 3), np.sqrt(2.0)) * (0.8, 1.0, 8.0)
+    width[0, 0, 0] = np.nan
+    np.testing.assert_allclose(expected_noise(width), EXPECTED_NOISE_VOXEL * np.array([1.0, 1.0, 8.0]))
+    np.testing.assert_allclose(expected_noise(np.full((1, 1, 1, 3), np.nan)), EXPECTED_NOISE_VOXEL)
+
+
+def test_prediction_is_the_median_of_neighbours_carried_by_median_slopes(rng: np.random.Generator) -> None:
+    field = rng.standard_normal((4, 5, 4, 3))
+    counted = rng.random(field.shape[:3]) < 0.9
+    usable = counted & (rng.random(field.shape[:3]) < 0.7)
+    told = predict(field, usable, counted, np.arange(usable.size))
+    known = np.pad(np.where(usable[..., np.newaxis], field, np.nan), [(1, 1)] * 3 + [(0, 0)], constant_values=np.nan)
+    places = np.stack(np.meshgrid(*[[-1, 0, 1]] * 3, indexing="ij"), axis=-1)
+    for number, (z, y, x) in enumerate(np.ndindex(usable.shape)):
+        cube = known[z : z + 3, y : y + 3, x : x + 3].copy()
+        cube[1, 1, 1] = np.nan
+        seen = np.pad(counted, 1)[z : z + 3, y : y + 3, x : x + 3].copy()
+        seen[1, 1, 1] = False
+        slopes = []
+        for axis in range(3):
+            first, middle, last = np.moveaxis(cube, axis, 0)
+            pairs = np.stack([middle - first, last - middle, 0.5 * (last - first)]).reshape(-1, 3)
+            slopes.append([np.median(s[np.isfinite(s)]) if np.isfinite(s).any() else 0.0 for s in pairs.T])
+        carried = (cube - places @ np.array(slopes))[np.isfinite(cube[..., 0])]
+        assert len(carried) > 0
+        middle = np.median(carried, axis=0)
+        np.testing.assert_allclose(told[0][number], middle, atol=1e-12)
+        np.testing.assert_allclose(told[1][number], np.median(np.abs(carried - middle), axis=0), atol=1e-12)
+        assert told[2][number] == pytest.approx(len(carried) / seen.sum())
+
+
+SHAPE = (2, 3, 4)
+
+
+def fields(rng: np.random.Generator, count: int) -> list[VectorField]:
+    ones, flag = np.ones(SHAPE), np.zeros(SHAPE, dtype=np.uint8)
+    made = []
+    for _ in range(count):
+        # A large mean, in which sums of squares would lose the fluctuations.
+        moved = 1e6 + rng.standard_normal((*SHAPE, 3))
+        grid = Grid(SHAPE[::-1], (0.8,) * 3, (0.0,) * 3)
+        made.append(VectorField(grid, moved, moved, ones, ones, ones, flag, None, (0.1,) * 3, 1e-3, (8, 8, 8)))
+    return made
+
+
+def test_mean_and_fluctuations_are_those_of_the_stack_without_what_is_rejected(rng: np.random.Generator) -> None:
+    batch = fields(rng, 5)
+    stack = np.stack([field.displacement_voxel for field in batch])
+    found = statistics_of(iter(batch))
+    np.testing.assert_allclose(found.mean.displacement_voxel, stack.mean(axis=0), rtol=1e-12)
+    np.testing.assert_allclose(found.rms_voxel, stack.std(axis=0), rtol=1e-8)
+    np.testing.assert_allclose(found.mean.uncertainty_voxel, stack.std(axis=0, ddof=1) / np.sqrt(5.0), rtol=1e-8)
+    assert np.all(found.samples == 5)
+    one, other = fields(rng, 2)
+    for batch in ([], [one, replace(other, dt_s=2e-3)]):
+        with pytest.raises(InputError):
+            statistics_of(batch)
+    batch = fields(rng, 3)
+    flag = np.zeros(SHAPE, dtype=np.uint8)
+    flag[0, 0, 0] = REJECTED
+    spoilt = np.where(flag[..., np.newaxis] == REJECTED, np.nan, batch[0].displacement_voxel)
+    batch[0] = replace(batch[0], flag=flag, displacement_voxel=spoilt)
+    nothing = [replace(field, flag=np.where(np.indices(SHAPE)[2] == 3, REJECTED, field.flag)) for field in batch]
+    found = statistics_of(nothing)
+    expected = np.mean([field.displacement_voxel[0, 0, 0] for field in batch[1:]], axis=0)
+    np.testing.assert_allclose(found.mean.displacement_voxel[0, 0, 0], expected, rtol=1e-12)
+    assert found.samples[0, 0, 0] == 2
+    assert np.all(found.mean.flag[..., 3] == REJECTED)
+    assert np.all(np.isnan(found.mean.velocity[..., 3, :]))
