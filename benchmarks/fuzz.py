@@ -38,8 +38,7 @@ from lfpiv_cli.files.images import count_pages, read_image
 from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, UNITS, Points, read_points, write_points
 from lfpiv_cli.files.vtkhdf import open_volume, write_volume
 from lfpiv_cli.files.weights_file import open_weights
-from lfpiv_cli.grid import Grid
-from lfpiv_cli.reference import FOCAL_POINT
+from lfpiv_cli.grid import FOCAL_POINT, Grid
 from lfpiv_cli.verbs.build_weights import build_weights_file
 from lfpiv_cli.verbs.plot import info
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from lfpiv_cli.scale import Scale
+from lfpiv_cli.grid import Scale
 from lfpiv_cli.synthetic.flows import advect, random_modes
 from lfpiv_cli.tracks.candidates import Light, Seen
 from lfpiv_cli.tracks.tracking import track

@@ -18,10 +18,9 @@ from lfpiv_cli.files.config import load_config
 from lfpiv_cli.files.images import read_image
 from lfpiv_cli.files.provenance import record
 from lfpiv_cli.files.vtkhdf import write_volume
-from lfpiv_cli.grid import Grid
+from lfpiv_cli.grid import Grid, Reference
 from lfpiv_cli.optics.camera import Camera, Lattice
 from lfpiv_cli.optics.media import Media, Window
-from lfpiv_cli.reference import Reference
 from tests.commands import CONFIG, SAMPLE, sample_weights
 
 # Magnification, focal length, aperture; microlenses' focal length and distance, their lattice; pixel, columns, rows.

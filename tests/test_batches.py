@@ -25,8 +25,7 @@ from lfpiv_cli.files.atomic import EventLog, ignores_case
 from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, read_points
 from lfpiv_cli.files.shares import DEAD_AFTER_S, claim_path, claimed
 from lfpiv_cli.files.vtkhdf import open_volume, write_volume
-from lfpiv_cli.grid import Grid
-from lfpiv_cli.reference import Reference
+from lfpiv_cli.grid import Grid, Reference
 from lfpiv_cli.verbs import reconstruct as stage
 from lfpiv_cli.verbs.batches import Worked
 from lfpiv_cli.verbs.tracers import TracerSize

@@ -14,8 +14,7 @@ from lfpiv_cli.errors import InputError
 from lfpiv_cli.files import vtkhdf
 from lfpiv_cli.flow.combining import combine
 from lfpiv_cli.flow.field import MASKED, REJECTED, REPLACED, SECOND_PEAK, VALID, VectorField
-from lfpiv_cli.grid import Grid
-from lfpiv_cli.reference import Reference
+from lfpiv_cli.grid import Grid, Reference
 
 GRID = Grid((10, 11, 12), (0.8, 0.8, 0.8), (-3.6, -4.0, -4.4))
 SHAPE = GRID.shape_zyx

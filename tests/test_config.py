@@ -18,9 +18,9 @@ from lfpiv_cli.files.config import Config, load_config
 from lfpiv_cli.files.sections import Section
 from lfpiv_cli.files.sections_work import Sections
 from lfpiv_cli.flow.windows import ParallelWalls, RoundWall, layout_windows
+from lfpiv_cli.grid import Reference
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import fluid_path_to_focus
-from lfpiv_cli.reference import Reference
 from lfpiv_cli.verbs.reconstruct import ReconstructOptions
 from tests.commands import CONFIG, sample_rig
 from tests.hostile_files import ended

@@ -15,7 +15,7 @@ from lfpiv_cli.files.config import Config
 from lfpiv_cli.files.hdf5 import read_tree, write_tree
 from lfpiv_cli.files.vtkhdf import open_volume
 from lfpiv_cli.files.weights_file import FORMAT, UNITS, VERSION, WeightsFile, open_weights, write_weights
-from lfpiv_cli.grid import Grid
+from lfpiv_cli.grid import Grid, Reference
 from lfpiv_cli.optics.camera import Lattice
 from lfpiv_cli.optics.curved_space import CurvedSpace, Face
 from lfpiv_cli.optics.media import Window, fluid_path_to_focus
@@ -23,7 +23,6 @@ from lfpiv_cli.optics.shapes import HeightMap
 from lfpiv_cli.optics.surfaces import Cylinder, Plane, Sphere, TiltedPlane
 from lfpiv_cli.optics.tracing import ObjectSpace
 from lfpiv_cli.reconstruction.solvers import SolverSettings, reconstruct
-from lfpiv_cli.reference import Reference
 from lfpiv_cli.verbs.build_weights import BuildWeightsOptions, build_weights_file, misfit_notices
 from lfpiv_cli.verbs.reconstruct import reconstruct_files as reconstruct_images
 from lfpiv_cli.weights import strip_blocks

@@ -25,9 +25,8 @@ from lfpiv_cli.files.particle_file import (
 )
 from lfpiv_cli.files.vtkhdf import write_vectors, write_volume
 from lfpiv_cli.flow.field import VectorField
-from lfpiv_cli.grid import Grid
+from lfpiv_cli.grid import Grid, Reference
 from lfpiv_cli.names import ExportFormat
-from lfpiv_cli.reference import Reference
 from tests.commands import run
 from tests.read_back import same
 

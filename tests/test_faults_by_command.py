@@ -21,8 +21,7 @@ from lfpiv_cli.files.config import load_config
 from lfpiv_cli.files.vtkhdf import open_vectors, write_vectors, write_volume
 from lfpiv_cli.flow.correlation import held_bytes
 from lfpiv_cli.flow.windows import CorrelationSettings
-from lfpiv_cli.grid import Grid
-from lfpiv_cli.reference import FOCAL_POINT
+from lfpiv_cli.grid import FOCAL_POINT, Grid
 from lfpiv_cli.validation.planning import depth_of_field_mm
 from lfpiv_cli.verbs import planning
 from tests.commands import AT_FOCUS, CONFIG, ROOT, SAMPLE, sample_rig

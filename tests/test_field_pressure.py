@@ -15,7 +15,7 @@ from lfpiv_cli.fields.stencils import Lattice
 from lfpiv_cli.fields.structure import Samples
 from lfpiv_cli.files.config import load_config
 from lfpiv_cli.files.particle_file import Points
-from lfpiv_cli.reference import FOCAL_POINT
+from lfpiv_cli.grid import FOCAL_POINT
 from lfpiv_cli.synthetic.flows import taylor_green
 from lfpiv_cli.tracks.candidates import Seen
 from lfpiv_cli.tracks.in_time import HighDerivatives, high_derivatives_in, high_derivatives_of, motion_of, motions_at

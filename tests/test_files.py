@@ -21,8 +21,7 @@ from lfpiv_cli.files.hdf5 import read_tree, write_tree
 from lfpiv_cli.files.provenance import record
 from lfpiv_cli.files.vtkhdf import open_vectors, open_volume, read_header, write_vectors, write_volume
 from lfpiv_cli.flow.field import VectorField
-from lfpiv_cli.grid import Grid
-from lfpiv_cli.reference import Reference
+from lfpiv_cli.grid import Grid, Reference
 from tests.commands import ROOT
 from tests.hostile_files import edited
 

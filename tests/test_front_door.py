@@ -18,10 +18,9 @@ from lfpiv_cli.files.sections import Section
 from lfpiv_cli.files.sections_work import flow_of
 from lfpiv_cli.flow.correlation import correlate
 from lfpiv_cli.flow.windows import WEIGHTINGS, CorrelationSettings
-from lfpiv_cli.grid import Grid
+from lfpiv_cli.grid import Grid, Reference
 from lfpiv_cli.reconstruction.registry import SOLVERS, Solver
 from lfpiv_cli.reconstruction.solvers import SolverSettings, reconstruct
-from lfpiv_cli.reference import Reference
 from lfpiv_cli.synthetic.flows import FLOWS
 from tests.commands import ROOT
 

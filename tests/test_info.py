@@ -14,8 +14,7 @@ from lfpiv_cli.files.hdf5 import write_tree
 from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, TRACKS_FORMAT, TRAJECTORIES_FORMAT, Points, write_points
 from lfpiv_cli.files.vtkhdf import write_vectors, write_volume
 from lfpiv_cli.flow.field import REJECTED, REPLACED, VALID, VectorField
-from lfpiv_cli.grid import Grid
-from lfpiv_cli.reference import Reference
+from lfpiv_cli.grid import Grid, Reference
 from tests.commands import table2_rig
 
 AT_FOCUS = Reference("focal_point", 0.0)

@@ -11,7 +11,7 @@ from scipy.spatial import KDTree
 
 from benchmarks.links import SCALE, Turbulence, shares
 from lfpiv_cli.arrays import Flags, Floats, Integers
-from lfpiv_cli.scale import Scale
+from lfpiv_cli.grid import Scale
 from lfpiv_cli.synthetic.flows import Flow, advect, random_modes, rigid_rotation
 from lfpiv_cli.tracks.candidates import NO_TRACK, Candidates, Light, Seen, light_ratio, long_ones
 from lfpiv_cli.tracks.gridding import Structure, kriged, on_grid, structure_of

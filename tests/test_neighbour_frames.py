@@ -7,6 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from lfpiv_cli.files.batch import Frame
+from lfpiv_cli.grid import Scale
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media
 from lfpiv_cli.particles.neighbour_frames import (
@@ -19,7 +20,6 @@ from lfpiv_cli.particles.neighbour_frames import (
 )
 from lfpiv_cli.particles.rounds import first_pass
 from lfpiv_cli.particles.search import Task
-from lfpiv_cli.scale import Scale
 from lfpiv_cli.verbs import particles as particles_interface
 from lfpiv_cli.verbs.particles import STEPS, Finder
 from tests.particle_images import found, task_with

@@ -33,11 +33,11 @@ from lfpiv_cli.files.images import write_tiff
 from lfpiv_cli.files.particle_file import Points
 from lfpiv_cli.files.provenance import earlier_record, with_warnings
 from lfpiv_cli.files.weights_file import open_weights
+from lfpiv_cli.grid import FOCAL_POINT
 from lfpiv_cli.notice import Notice
 from lfpiv_cli.optics.camera import Camera, Lattice, thin_lens
 from lfpiv_cli.optics.media import Media, Window
 from lfpiv_cli.optics.tracing import refraction_error_mm, sine_error_mm
-from lfpiv_cli.reference import FOCAL_POINT
 from lfpiv_cli.verbs.build_weights import plan_of
 from lfpiv_cli.verbs.checks import doubt_notices, few_notices, still_notices
 from lfpiv_cli.verbs.tracers import light_notices

@@ -15,7 +15,7 @@ from lfpiv_cli.cli.main import cli
 from lfpiv_cli.errors import LimitMissedError
 from lfpiv_cli.files.vtkhdf import write_vectors
 from lfpiv_cli.flow.field import VALID, VectorField
-from lfpiv_cli.grid import Grid
+from lfpiv_cli.grid import FOCAL_POINT, Grid
 from lfpiv_cli.optics.media import equivalent_object_distance
 from lfpiv_cli.paper import small_rig
 from lfpiv_cli.paper.faults import (
@@ -48,7 +48,6 @@ from lfpiv_cli.paper.influences import (
 from lfpiv_cli.paper.parts import sections
 from lfpiv_cli.paper.sensitivities import INFLUENCES, Measured, care, crowding, drawing_of, rows_of, table_of
 from lfpiv_cli.paper.small_rig import CHANNEL, WATER, Case, Rig, displacement
-from lfpiv_cli.reference import FOCAL_POINT
 from lfpiv_cli.validation.volume import TERMS, fit_errors, pairs_of
 
 Points = NDArray[np.float64]

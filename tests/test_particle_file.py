@@ -20,7 +20,7 @@ from lfpiv_cli.files.particle_file import (
     symmetric,
     write_points,
 )
-from lfpiv_cli.reference import Reference
+from lfpiv_cli.grid import Reference
 from lfpiv_cli.verbs.track import KEPT_FRAMES, SeenFrames
 
 REFERENCE = Reference("mid_plane", -0.4)

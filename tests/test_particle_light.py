@@ -14,11 +14,19 @@ from lfpiv_cli.files.config import carried_config
 from lfpiv_cli.files.weights_file import WeightsFile
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media
-from lfpiv_cli.particles import light_errors
+from lfpiv_cli.particles import search
 from lfpiv_cli.particles.fitting import add_all
-from lfpiv_cli.particles.light_errors import MUCH_LEFT, changes_of_light, grown, light_left
 from lfpiv_cli.particles.microlens_focus import FEWEST_PARTICLES, FocalLength, focal_length_of
-from lfpiv_cli.particles.search import blank, noise_with, rebuilt, result
+from lfpiv_cli.particles.search import (
+    MUCH_LEFT,
+    blank,
+    changes_of_light,
+    grown,
+    light_left,
+    noise_with,
+    rebuilt,
+    result,
+)
 from lfpiv_cli.particles.view import View, raw_view
 from lfpiv_cli.verbs.frames import Bench, bench_of, frame_notices
 from lfpiv_cli.verbs.particles import find, frame_of, points_of, task_for, tracers_per_lens
@@ -79,8 +87,8 @@ def test_changes_are_those_of_independent_errors(view: View, monkeypatch: pytest
     def add_all(sized: View, _: object, sign: float, image: Floats, depths: object) -> None:
         image += sign * (3.0 * (2.0 * sized.particle_radius_mm / scene) ** 2 + 5.0 * sized.diffusion_px**2)
 
-    monkeypatch.setattr(light_errors, "with_diffusion", with_diffusion)
-    monkeypatch.setattr(light_errors, "add_all", add_all)
+    monkeypatch.setattr(search, "with_diffusion", with_diffusion)
+    monkeypatch.setattr(search, "add_all", add_all)
     covariance = np.array([[4e-4, -1e-4], [-1e-4, 2e-4]])
     for diameter in (0.5, 0.01):
         sized = view._replace(particle_radius_mm=0.5 * diameter * scene, diffusion_px=0.3)

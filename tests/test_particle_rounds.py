@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from lfpiv_cli.grid import Grid
+from lfpiv_cli.grid import Grid, Scale
 from lfpiv_cli.names import ColumnAxis, Layout
 from lfpiv_cli.optics.camera import Camera, Lattice
 from lfpiv_cli.optics.media import Media
@@ -19,7 +19,6 @@ from lfpiv_cli.particles.rounds import ROUNDS, find_particles, first_pass, first
 from lfpiv_cli.particles.search import noise_with, task_of
 from lfpiv_cli.particles.view import raw_view
 from lfpiv_cli.reconstruction.solvers import normalisers
-from lfpiv_cli.scale import Scale
 from lfpiv_cli.synthetic.render import Balls, render_points
 from lfpiv_cli.validation.volume import particle_figures
 from lfpiv_cli.weights.build import default_padding, factorise, factorise_bricks

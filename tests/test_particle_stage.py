@@ -22,7 +22,7 @@ from lfpiv_cli.files.particle_file import (
 )
 from lfpiv_cli.files.particles import read_particles
 from lfpiv_cli.files.vtkhdf import open_vectors
-from lfpiv_cli.reference import Reference
+from lfpiv_cli.grid import Reference
 from lfpiv_cli.validation.volume import particle_figures
 from tests.commands import run
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from lfpiv_cli.files.config import load_config
 from lfpiv_cli.files.vtkhdf import write_vectors
 from lfpiv_cli.flow.field import MASKED, REJECTED, VALID, VectorField
-from lfpiv_cli.grid import Grid
+from lfpiv_cli.grid import Grid, Reference
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.curved_space import CurvedSpace, Face
 from lfpiv_cli.optics.media import Media
@@ -28,7 +28,6 @@ from lfpiv_cli.pictures.style import (
     styled,
     symmetric_limit,
 )
-from lfpiv_cli.reference import Reference
 from lfpiv_cli.verbs.plot import figures_of
 
 matplotlib = pytest.importorskip("matplotlib")

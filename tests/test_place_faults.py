@@ -18,7 +18,7 @@ import pytest
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.files.particles import read_particles
 from lfpiv_cli.files.vtkhdf import write_vectors
-from lfpiv_cli.reference import FOCAL_POINT
+from lfpiv_cli.grid import FOCAL_POINT
 from tests.hostile_files import ended
 from tests.vector_fields import SHAPE, field_of
 

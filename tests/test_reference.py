@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from lfpiv_cli.grid import Grid
+from lfpiv_cli.grid import FOCAL_POINT, Grid, Reference
 from lfpiv_cli.neighbourhoods import largest_around, opened, smallest_around, with_neighbours
-from lfpiv_cli.reference import FOCAL_POINT, Reference
 
 # Binary fractions, so that sums and differences are exact.
 MID_PLANE = Reference("mid_plane", -0.375)

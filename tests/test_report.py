@@ -25,9 +25,8 @@ from lfpiv_cli.files.particle_file import (
 )
 from lfpiv_cli.files.provenance import sha256
 from lfpiv_cli.files.vtkhdf import write_vectors, write_volume
-from lfpiv_cli.grid import Grid
+from lfpiv_cli.grid import Grid, Reference
 from lfpiv_cli.pictures.points import MOST_LINES, lines_view
-from lfpiv_cli.reference import Reference
 from lfpiv_cli.verbs import report as stage
 from lfpiv_cli.verbs.plot import figures_of
 from lfpiv_cli.verbs.report import ReportOptions, contents_of, report

@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from lfpiv_cli.files.particle_file import POSITION
-from lfpiv_cli.scale import Scale
+from lfpiv_cli.grid import Scale
 from lfpiv_cli.synthetic.flows import advect, rigid_rotation, taylor_green
 from lfpiv_cli.tracks.candidates import NO_TRACK, Seen, Trajectories
 from lfpiv_cli.tracks.gridding import on_grid

@@ -19,8 +19,7 @@ from lfpiv_cli.files.vtkhdf import open_vectors, read_header, write_volume
 from lfpiv_cli.flow.correlation import correlate
 from lfpiv_cli.flow.field import MASKED
 from lfpiv_cli.flow.windows import CorrelationSettings, WindowLayout, layout_windows
-from lfpiv_cli.grid import Grid
-from lfpiv_cli.reference import Reference
+from lfpiv_cli.grid import Grid, Reference
 from lfpiv_cli.verbs.checks import (
     Quality,
     calibration_notices,

@@ -18,7 +18,7 @@ from lfpiv_cli.files.particle_file import TRACKS_FORMAT, Points, open_tracks, wr
 from lfpiv_cli.flow.correlation import SMALLEST_VALID_FRACTION
 from lfpiv_cli.flow.field import MASKED
 from lfpiv_cli.flow.windows import RoundWall
-from lfpiv_cli.reference import Reference
+from lfpiv_cli.grid import Reference
 from lfpiv_cli.synthetic.flows import pipe
 from lfpiv_cli.verbs.field import FieldOptions, fit_flow, read_places
 from lfpiv_cli.verbs.fields import LARGEST_CHI2, fit_notices, fitted, samples_of_tracks

@@ -14,8 +14,7 @@ from lfpiv_cli.files.config import load_config
 from lfpiv_cli.files.particles import Particles, write_particles
 from lfpiv_cli.files.vtkhdf import write_vectors
 from lfpiv_cli.flow.field import VectorField
-from lfpiv_cli.grid import Grid
-from lfpiv_cli.reference import Reference
+from lfpiv_cli.grid import Grid, Reference
 from lfpiv_cli.synthetic.flows import shear
 from lfpiv_cli.verbs import validate
 from lfpiv_cli.verbs.validate import _truth_of_particles, light_notices, validate_flow

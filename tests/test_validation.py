@@ -12,10 +12,9 @@ import pytest
 from lfpiv_cli.errors import ConfigError, InputError, LimitMissedError
 from lfpiv_cli.files.particles import Particles, write_particles
 from lfpiv_cli.files.vtkhdf import write_volume
-from lfpiv_cli.grid import Grid
+from lfpiv_cli.grid import Grid, Reference
 from lfpiv_cli.optics.camera import Lattice
 from lfpiv_cli.optics.tracing import ObjectSpace
-from lfpiv_cli.reference import Reference
 from lfpiv_cli.validation.board import DEPTH_DEFINITIONS, board_figures, elongation_mm, gaussian_centre_mm, measure_dots
 from lfpiv_cli.validation.volume import (
     known_volume,

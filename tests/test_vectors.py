@@ -24,9 +24,7 @@ from lfpiv_cli.flow.field import (
 from lfpiv_cli.flow.outliers import INTERPOLATION_VOXEL, mixing, smooth_field, unresolved
 from lfpiv_cli.flow.peaks import LOCKING_LENSES, with_locking
 from lfpiv_cli.flow.windows import CorrelationSettings, ParallelWalls, RoundWall, inside
-from lfpiv_cli.grid import Grid
-from lfpiv_cli.reference import Reference
-from lfpiv_cli.scale import Scale
+from lfpiv_cli.grid import Grid, Reference, Scale
 from tests.vector_fields import SHAPE, SIGMA_VOXEL, SPACING_MM, VOXEL_MM, field_of, noise_mm, places_mm, rotation_mm
 
 

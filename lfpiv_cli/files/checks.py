@@ -14,10 +14,10 @@ from lfpiv_cli.files.sections import CylinderFace, HeightMapFace, scene_of
 from lfpiv_cli.files.sections_work import Sections, SimulationSection
 from lfpiv_cli.files.yaml_nodes import Document, KeyPath, Problem, key_name, place_of, problem_of, report
 from lfpiv_cli.flow.windows import RoundWall
+from lfpiv_cli.grid import FOCAL_POINT
 from lfpiv_cli.notice import written
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Window, equivalent_object_distance, fluid_path_to_focus
-from lfpiv_cli.reference import FOCAL_POINT
 
 Found = Iterator[tuple[KeyPath, str]]
 

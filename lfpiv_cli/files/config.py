@@ -39,7 +39,7 @@ from lfpiv_cli.files.sections_work import (
 )
 from lfpiv_cli.files.yaml_nodes import Document, read_rig
 from lfpiv_cli.flow.windows import CorrelationSettings, ParallelWalls, Walls
-from lfpiv_cli.grid import Grid
+from lfpiv_cli.grid import FOCAL_POINT, Grid, Reference
 from lfpiv_cli.names import Refraction
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.curved_space import CurvedSpace
@@ -48,7 +48,6 @@ from lfpiv_cli.optics.surfaces import SURFACES
 from lfpiv_cli.optics.tracing import ObjectSpace
 from lfpiv_cli.reconstruction.registry import SOLVERS
 from lfpiv_cli.reconstruction.solvers import SolverSettings, Stopping
-from lfpiv_cli.reference import FOCAL_POINT, Reference
 from lfpiv_cli.synthetic.flows import Flow
 
 # Of the paper's final window along the axis with the smallest voxels; the coarse one is twice as large: a displacement

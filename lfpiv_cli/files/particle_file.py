@@ -34,7 +34,7 @@ from lfpiv_cli.files.hdf5 import (
 )
 from lfpiv_cli.files.inputs import reason
 from lfpiv_cli.files.vtkhdf import create_vtk_group, read_root, write_root
-from lfpiv_cli.reference import Reference
+from lfpiv_cli.grid import Reference
 
 # The places of a sequence's tracks on a disk: put there a frame at a time, read by frame or by track.
 #

@@ -14,14 +14,12 @@ from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Dis
 from pydantic_core import PydanticCustomError
 
 from lfpiv_cli.flow.windows import LARGEST_TILT_DEG, RoundWall
-from lfpiv_cli.grid import Grid
+from lfpiv_cli.grid import Grid, Reference, Scale
 from lfpiv_cli.names import ColumnAxis, Facing, Layout, Medium, Pattern, Polarity, ReferenceName
 from lfpiv_cli.optics.camera import Camera, Lattice, thin_lens
 from lfpiv_cli.optics.curved_space import CurvedSpace, Face
 from lfpiv_cli.optics.media import Media
 from lfpiv_cli.optics.surfaces import SURFACES
-from lfpiv_cli.reference import Reference
-from lfpiv_cli.scale import Scale
 
 # What the keys of the configuration can be: numbers within ranges, one for each axis, and what all sections share.
 

@@ -36,6 +36,7 @@ from lfpiv_cli.files.sections import (
     Windows,
     WindowSection,
 )
+from lfpiv_cli.grid import Reference
 from lfpiv_cli.names import (
     BoardImages,
     BoardMethod,
@@ -51,7 +52,6 @@ from lfpiv_cli.names import (
 from lfpiv_cli.optics.line_responses import USUAL_DIFFUSION_PX
 from lfpiv_cli.optics.waves import Waves
 from lfpiv_cli.reconstruction.registry import SolverName
-from lfpiv_cli.reference import Reference
 from lfpiv_cli.synthetic.flows import FLOWS, Flow
 
 # Each point is carried by all of them: of more, a frame of many tracers takes gigabytes.

@@ -31,8 +31,7 @@ from lfpiv_cli.files.hdf5 import (
     write_header,
 )
 from lfpiv_cli.flow.field import REJECTED, VectorField
-from lfpiv_cli.grid import Grid
-from lfpiv_cli.reference import Reference
+from lfpiv_cli.grid import Grid, Reference
 
 # What all `*.vtkhdf` files have in common: VTK's header, and what a file says about itself at its root.
 

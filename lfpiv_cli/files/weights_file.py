@@ -54,7 +54,7 @@ from lfpiv_cli.files.sections import (
     scene_of,
 )
 from lfpiv_cli.files.yaml_nodes import Document, problem_of
-from lfpiv_cli.grid import Grid
+from lfpiv_cli.grid import Grid, Reference
 from lfpiv_cli.names import ColumnAxis, Layout, Refraction, TracedMethod
 from lfpiv_cli.notice import written
 from lfpiv_cli.optics.camera import Camera, Lattice
@@ -62,7 +62,6 @@ from lfpiv_cli.optics.curved_space import CurvedSpace
 from lfpiv_cli.optics.media import Media, Window
 from lfpiv_cli.optics.surfaces import SURFACES
 from lfpiv_cli.optics.tracing import ObjectSpace
-from lfpiv_cli.reference import Reference
 from lfpiv_cli.simd import COEFFICIENTS
 from lfpiv_cli.weights.axis import AxisWeights
 from lfpiv_cli.weights.columns import ColumnOperator, OnDemandOperator

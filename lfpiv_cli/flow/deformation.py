@@ -101,7 +101,7 @@ def filter_lines(lines: Singles, factors: Singles) -> None:
 
 @njit(cache=True, nogil=True)
 def filter_planes(part: tuple[int, int], volume: Singles, scale: np.float32, coefficients: Singles) -> None:
-    """Write the B-spline coefficients along x and y of a volume times `scale`, planes `part` of them."""
+    """Write the B-spline coefficients along x and y of a volume times planes `part` of them."""
     along_y, along_x = pivots(volume.shape[1]), pivots(volume.shape[2])
     for z in range(part[0], part[1]):
         plane = volume[z] * scale

@@ -13,8 +13,7 @@ from numba import njit
 
 from lfpiv_cli.arrays import Flags, Floats
 from lfpiv_cli.flow.field import VectorField
-from lfpiv_cli.reference import Reference
-from lfpiv_cli.scale import Scale
+from lfpiv_cli.grid import Reference, Scale
 from lfpiv_cli.threads import share_out
 
 # Locking: near the focal plane volumes draw lateral displacements towards whole microlenses.

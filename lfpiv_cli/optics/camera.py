@@ -16,9 +16,9 @@ from numba import njit
 from numpy.typing import ArrayLike
 
 from lfpiv_cli.arrays import Floats, Integers
+from lfpiv_cli.grid import Scale
 from lfpiv_cli.names import ColumnAxis, Layout
 from lfpiv_cli.optics.media import Media
-from lfpiv_cli.scale import Scale
 
 # Undoing r' = r (1 + k1 r^2) by repetition: each round gains a factor 3 k1 r^2, below 0.01 for usable lenses.
 UNDISTORT_ROUNDS = 6

@@ -19,7 +19,7 @@ from lfpiv_cli.calibration.model import Channel, advised_move_mm, mid_plane_z_mm
 from lfpiv_cli.flow.correlation import correlate
 from lfpiv_cli.flow.field import REJECTED
 from lfpiv_cli.flow.windows import CorrelationSettings
-from lfpiv_cli.grid import Grid
+from lfpiv_cli.grid import Grid, Reference
 from lfpiv_cli.names import Refraction
 from lfpiv_cli.optics.camera import Camera, Lattice, refocused
 from lfpiv_cli.optics.media import Media, channel_window
@@ -28,7 +28,6 @@ from lfpiv_cli.particles.rounds import ROUNDS, Round, find_particles
 from lfpiv_cli.particles.search import task_of
 from lfpiv_cli.particles.view import lens_pixels, raw_view
 from lfpiv_cli.reconstruction.solvers import SolverSettings, normalisers, reconstruct
-from lfpiv_cli.reference import Reference
 from lfpiv_cli.robust import MAD_TO_SIGMA
 from lfpiv_cli.synthetic.render import Balls, Readout, render_points
 from lfpiv_cli.synthetic.scenes import Misalignment

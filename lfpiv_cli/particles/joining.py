@@ -26,6 +26,7 @@ from scipy import ndimage
 from scipy.spatial import KDTree
 
 from lfpiv_cli.arrays import Floats
+from lfpiv_cli.grid import Scale
 from lfpiv_cli.particles.fitting import Choice, begin_at, fit_best, nothing_expected
 from lfpiv_cli.particles.least_squares import (
     CHOICE_GAIN,
@@ -43,7 +44,6 @@ from lfpiv_cli.particles.search import SAME_DEPTHS, SAME_LENSES, State, Task, ob
 from lfpiv_cli.particles.suspects import good_chi2
 from lfpiv_cli.particles.view import footprint_radius_mm, over_tiles
 from lfpiv_cli.reconstruction.solvers import Normalisers, Problem, em_step, uniform_start
-from lfpiv_cli.scale import Scale
 from lfpiv_cli.weights.model import Weights
 
 # Where particles may be: peaks of a volume that explains what the particles found so far do not.

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from lfpiv_cli.arrays import Floats
+from lfpiv_cli.grid import Scale
 from lfpiv_cli.particles.fitting import add_all
 from lfpiv_cli.particles.joining import with_twins_joined
 from lfpiv_cli.particles.least_squares import SEARCH_GAIN
@@ -49,7 +50,6 @@ from lfpiv_cli.particles.search import (
     with_typical_light,
 )
 from lfpiv_cli.particles.suspects import SUSPECT_CHI2, good_chi2, settled
-from lfpiv_cli.scale import Scale
 from lfpiv_cli.tracks.candidates import Light, Seen
 from lfpiv_cli.tracks.tracking import expected_of, known_of, track
 

@@ -19,7 +19,6 @@ from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.particles.covariance import joint_covariance
 from lfpiv_cli.particles.fitting import add_all, judge, nothing_expected, refine
 from lfpiv_cli.particles.least_squares import SMALLEST_GAIN, Observation, observation_of
-from lfpiv_cli.particles.light_errors import changes_of_light, grown, light_left
 from lfpiv_cli.particles.noise import (
     LEAST_SHARE_OF_LIT,
     LIT_SIGMAS,
@@ -30,7 +29,7 @@ from lfpiv_cli.particles.noise import (
     pixel_weights,
     read_noise,
 )
-from lfpiv_cli.particles.view import View, footprint_radius_mm, lens_pixels, on_array_mm
+from lfpiv_cli.particles.view import View, footprint_radius_mm, lens_pixels, on_array_mm, with_diffusion
 from lfpiv_cli.reconstruction.solvers import Normalisers
 from lfpiv_cli.weights.model import Weights
 
@@ -89,7 +88,7 @@ SMALLEST_SEEN = 0.1
 # that itself, and it counts as so many times as much. Single frames of 0.4 to 1.2 tracers per microlens are covered by
 # that.
 GOOD_PERCENTILE, TAKEN_UP = 20.0, 2.0
-# Lengths are in the camera's own units (`scale`): microlenses laterally, depths over which light spreads by one lens
+# Lengths are in the camera's own units (`Scale`): microlenses laterally, depths over which light spreads by one lens
 # (Table 2: 0.04, 0.25 and 0.3 mm).
 # Two particles this close, laterally and in depth, are in one place.
 SAME_LENSES, SAME_DEPTHS = 0.4, 0.25 / 1.064
@@ -372,3 +371,61 @@ def result(task: Task, state: State) -> Particles:
         residual=state.residual.reshape(shape),
         noise=state.noise,
     )
+
+
+# Errors that particles share: those of their size and the sensor's charge diffusion, and those of the model of light.
+#
+# They move the particles of an image all in one way: no fit shows them as noise.
+
+
+# Where particles leave this share of an image's light, its noise taken off, more than at any crowd at which most are
+# found, the model of light is wrong, or tracers are missing. Beyond, its errors are alike in all lenses, first in part.
+MUCH_LEFT = 0.1
+
+
+def changes_of_light(view: View, particles: Floats, covariance: Floats, depths_mm: tuple[float, float]) -> Floats:
+    """Return what the light of all particles (n, 4) changes by with each independent error, (2, pixels), by waves.
+
+    Parameters
+    ----------
+    covariance : (2, 2) of the squares of diameter, microlenses^2, and of diffusion, px^2
+    """
+    squares = np.square([2.0 * view.particle_radius_mm / view.scale.lens_mm, view.diffusion_px])
+
+    def image(square: Floats) -> Floats:
+        diameter, diffusion_px = np.sqrt(np.maximum(square, 0.0))
+        sized = view._replace(particle_radius_mm=0.5 * float(diameter) * view.scale.lens_mm)
+        lit = np.zeros(view.camera.rows * view.camera.columns)
+        add_all(with_diffusion(sized, float(diffusion_px)), particles, 1.0, lit, depths_mm)
+        return lit
+
+    # Of independent errors: none is larger than what it is of. A square that is as small as its error only grows.
+    sides = [(squares + error, squares - error) for error in np.linalg.cholesky(covariance).T]
+    return np.stack(
+        [
+            0.5 * (image(more) - image(less)) if less.min() >= 0.0 else image(more) - image(squares)
+            for more, less in sides
+        ]
+    )
+
+
+def light_left(image: Floats, residual: Floats, read_counts: float) -> float:
+    """Return the share of an image's light (pixels,) that particles leave, its read noise taken off."""
+    light = float(np.sum(image**2))
+    return float(np.sqrt(max(np.sum(residual**2) - residual.size * read_counts**2, 0.0) / light)) if light else 0.0
+
+
+def grown(view: View, particles: Floats, covariance: Floats, left: float) -> Floats:
+    """Return covariances (n, 4, 4) of particles (n, 4) that leave a share of the light, larger where it is much.
+
+    What a model gets wrong is alike in all lenses that a particle lights: for depth and light it adds up from lens to
+    lens. Sideways lenses on either side of the spot make up for each other, and as much is taken to be left as goes
+    with the spot's diameter.
+    """
+    alike = float(np.clip((left / MUCH_LEFT) ** 2 - 1.0, 0.0, 1.0))
+    radius = 0.5 * footprint_radius_mm(view, particles) / np.sqrt(view.half_x_mm * view.half_y_mm)
+    # Cells that a disc touches, on the mean.
+    lenses = 1.0 + 4.0 * radius + np.pi * radius**2
+    deep, sideways = np.sqrt(1.0 + alike * lenses), np.sqrt(1.0 + alike * np.sqrt(lenses))
+    growth = np.stack([sideways, sideways, deep, deep], axis=-1)
+    return np.asarray(covariance * growth[:, :, np.newaxis] * growth[:, np.newaxis, :])

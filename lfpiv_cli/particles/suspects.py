@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from lfpiv_cli.arrays import Floats
+from lfpiv_cli.grid import Scale
 from lfpiv_cli.particles.fitting import Choice, fit_again, fit_best
 from lfpiv_cli.particles.least_squares import (
     CHOICE_GAIN,
@@ -28,7 +29,6 @@ from lfpiv_cli.particles.least_squares import (
 )
 from lfpiv_cli.particles.search import SMALLEST_LIGHT, State, Task, observed, usual_chi2
 from lfpiv_cli.particles.view import footprint_px, footprint_radius_mm, over_tiles
-from lfpiv_cli.scale import Scale
 
 # Overlapping particle images: two particles where one was found, if two explain the light much better.
 #

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from lfpiv_cli.arrays import Floats
 from lfpiv_cli.calibration.model import Calibration
 from lfpiv_cli.errors import ConfigError
+from lfpiv_cli.grid import Scale
 from lfpiv_cli.optics.camera import Camera, KernelCamera, Lattice
 from lfpiv_cli.optics.curved_space import CurvedSpace
 from lfpiv_cli.optics.line_responses import NO_LINES, LineResponses, line_responses, of_balls, on_pixels
@@ -28,7 +29,6 @@ from lfpiv_cli.optics.surfaces import Faces
 from lfpiv_cli.optics.tracing import ObjectSpace
 from lfpiv_cli.particles.cells import NO_SHARES, cell_shares, hexagon_radius, rim_table, smallest_ball_mm
 from lfpiv_cli.particles.pencil import lines_of
-from lfpiv_cli.scale import Scale
 from lfpiv_cli.threads import in_threads
 from lfpiv_cli.weights.scene import NO_FACES
 

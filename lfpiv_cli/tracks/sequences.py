@@ -15,8 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from lfpiv_cli.arrays import Floats, Integers
+from lfpiv_cli.grid import Scale
 from lfpiv_cli.robust import MAD_TO_SIGMA
-from lfpiv_cli.scale import Scale
 from lfpiv_cli.tracks.candidates import NO_PARTICLE, NO_TRACK, Frames, Seen, Trajectories, long_ones, places, tracks_in
 from lfpiv_cli.tracks.gridding import kriged, structure_of
 from lfpiv_cli.tracks.in_time import FEWEST_TRACKS, Scatter, State, fit_in_time, scatter_of

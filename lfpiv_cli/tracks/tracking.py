@@ -19,8 +19,8 @@ from numba import njit
 from scipy.spatial import KDTree
 
 from lfpiv_cli.arrays import Flags, Floats, Integers
+from lfpiv_cli.grid import Scale
 from lfpiv_cli.robust import MAD_TO_SIGMA
-from lfpiv_cli.scale import Scale
 from lfpiv_cli.threads import share_out
 from lfpiv_cli.tracks.candidates import Candidates, Seen, candidates_of
 from lfpiv_cli.tracks.gridding import kriged, structure_of

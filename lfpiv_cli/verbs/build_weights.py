@@ -20,13 +20,12 @@ from lfpiv_cli.files.config import Config, load_config
 from lfpiv_cli.files.inputs import given
 from lfpiv_cli.files.provenance import record, with_warnings
 from lfpiv_cli.files.weights_file import WeightsFile, open_weights, write_weights
-from lfpiv_cli.grid import Grid
+from lfpiv_cli.grid import Grid, Reference
 from lfpiv_cli.names import Method, Refraction, Sampling
 from lfpiv_cli.notice import Notice, warn_of, written
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.curved_space import CurvedSpace
 from lfpiv_cli.optics.tracing import ObjectSpace, PolynomialRays
-from lfpiv_cli.reference import Reference
 from lfpiv_cli.verbs import weights_cost
 from lfpiv_cli.weights.build import default_padding, scene_distortion
 from lfpiv_cli.weights.columns import ColumnOperator, OnDemandOperator, operator_of, seen_share

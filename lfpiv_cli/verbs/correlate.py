@@ -30,9 +30,8 @@ from lfpiv_cli.flow.correlation import count_passes, held_bytes
 from lfpiv_cli.flow.field import REJECTED, VectorField, derived_fields
 from lfpiv_cli.flow.peaks import with_locking
 from lfpiv_cli.flow.windows import inside
-from lfpiv_cli.grid import Grid
+from lfpiv_cli.grid import FOCAL_POINT, Grid
 from lfpiv_cli.notice import warn_of
-from lfpiv_cli.reference import FOCAL_POINT
 from lfpiv_cli.verbs import checks
 from lfpiv_cli.verbs.batches import ALL, BatchOptions, Expected, Failure, Worked, dry_run, work_through
 from lfpiv_cli.verbs.fields import Mean, are_measured, arrays_of, mean_of_measured

@@ -35,9 +35,9 @@ from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, Points, no_points, r
 from lfpiv_cli.files.provenance import even_step_s, record, sha256, with_warnings
 from lfpiv_cli.files.shares import awaited
 from lfpiv_cli.files.weights_file import WeightsFile
+from lfpiv_cli.grid import Reference
 from lfpiv_cli.notice import Notice
 from lfpiv_cli.particles.neighbour_frames import STEPS as PREDICTED_STEPS
-from lfpiv_cli.reference import Reference
 from lfpiv_cli.tracks.candidates import Trajectories
 from lfpiv_cli.verbs import particles
 from lfpiv_cli.verbs.batches import ALL, Batch, BatchOptions, Failure, WorkOptions, dry_run, work_through

@@ -27,11 +27,10 @@ from lfpiv_cli.optics.line_responses import USUAL_DIFFUSION_PX
 from lfpiv_cli.optics.tracing import ObjectSpace
 from lfpiv_cli.particles.counting import tracers_per_lens as counted
 from lfpiv_cli.particles.diameter import UNKNOWN_LENSES, Diameter, diameter_by
-from lfpiv_cli.particles.light_errors import MUCH_LEFT
 from lfpiv_cli.particles.microlens_focus import FocalLength, focal_length_of
 from lfpiv_cli.particles.neighbour_frames import second_frame, second_pass
 from lfpiv_cli.particles.rounds import ROUNDS, first_pass
-from lfpiv_cli.particles.search import LAST_UNEXPLAINED, Particles, Task, result, task_of
+from lfpiv_cli.particles.search import LAST_UNEXPLAINED, MUCH_LEFT, Particles, Task, result, task_of
 from lfpiv_cli.particles.view import Light, View, ensure_square_cells, raw_view
 from lfpiv_cli.reconstruction.images import Image, Mask, filled, light
 from lfpiv_cli.reconstruction.solvers import Normalisers

@@ -21,12 +21,10 @@ from lfpiv_cli.errors import ConfigError, InputError
 from lfpiv_cli.files.config import Config
 from lfpiv_cli.files.sections import NM_TO_MM, UM_TO_MM
 from lfpiv_cli.flow.windows import ROUNDING, WindowLayout
-from lfpiv_cli.grid import Grid
+from lfpiv_cli.grid import Grid, Reference, Scale
 from lfpiv_cli.notice import written
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media
-from lfpiv_cli.reference import Reference
-from lfpiv_cli.scale import Scale
 from lfpiv_cli.synthetic.flows import MM_PER_M
 from lfpiv_cli.synthetic.render import Readout
 from lfpiv_cli.validation import planning

@@ -27,12 +27,11 @@ from lfpiv_cli.files.inputs import ensure_room
 from lfpiv_cli.files.particles import Particles, write_particles
 from lfpiv_cli.files.provenance import record
 from lfpiv_cli.flow.windows import RoundWall
-from lfpiv_cli.grid import Grid
+from lfpiv_cli.grid import FOCAL_POINT, Grid, Reference
 from lfpiv_cli.notice import Notice, written
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.curved_space import CurvedSpace
 from lfpiv_cli.optics.tracing import ObjectSpace
-from lfpiv_cli.reference import FOCAL_POINT, Reference
 from lfpiv_cli.synthetic import scenes
 from lfpiv_cli.synthetic.board import BoardPlacement, points_of
 from lfpiv_cli.synthetic.flows import STEADY, Pulsation

@@ -12,7 +12,7 @@ from lfpiv_cli.files.particle_file import Points
 from lfpiv_cli.notice import Notice, written
 from lfpiv_cli.particles.diameter import LIMIT_SIGMAS
 from lfpiv_cli.particles.diffusion import USUAL_SIGMA_PX
-from lfpiv_cli.particles.light_errors import MUCH_LEFT
+from lfpiv_cli.particles.search import MUCH_LEFT
 
 # More than this share of an image's light, its noise taken off, is too much to leave unexplained.
 LARGEST_UNEXPLAINED = 0.2

@@ -21,8 +21,8 @@ from lfpiv_cli.files.inputs import given
 from lfpiv_cli.files.pairing import Pairs, in_order
 from lfpiv_cli.files.provenance import carried_record, record, with_warnings
 from lfpiv_cli.flow.field import REJECTED
+from lfpiv_cli.grid import Reference
 from lfpiv_cli.names import GridMethod
-from lfpiv_cli.reference import Reference
 from lfpiv_cli.tracks.candidates import Seen, Trajectories
 from lfpiv_cli.tracks.sequences import HALVES_FRAMES
 from lfpiv_cli.verbs import checks

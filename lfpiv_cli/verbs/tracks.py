@@ -17,9 +17,8 @@ from lfpiv_cli.files.provenance import OF_FRAMES, ensure_agreement, even_step_s,
 from lfpiv_cli.flow.combining import Paths, WindowGrid, vectors_from_paths
 from lfpiv_cli.flow.field import MM_TO_M, VectorField
 from lfpiv_cli.flow.windows import Walls
+from lfpiv_cli.grid import Reference, Scale
 from lfpiv_cli.notice import warn_of
-from lfpiv_cli.reference import Reference
-from lfpiv_cli.scale import Scale
 from lfpiv_cli.tracks.candidates import Light, Seen, Trajectories, long_ones
 from lfpiv_cli.tracks.in_time import Scatter
 from lfpiv_cli.tracks.sequences import SHORTEST, follow, scatter_in, states_at

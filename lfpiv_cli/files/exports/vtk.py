@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from lfpiv_cli.files.hdf5 import FILTERS, created, write_array, write_rows
 from lfpiv_cli.files.particle_file import CELLS, POSITION, TRAJECTORIES_FORMAT, UNITS, PointRows, Points, lines_of
 from lfpiv_cli.files.vtkhdf import create_vtk_group, write_root, write_steps
-from lfpiv_cli.reference import Reference
+from lfpiv_cli.grid import Reference
 
 if TYPE_CHECKING:
     from lfpiv_cli.files.exports.formats import Content
