@@ -101,7 +101,7 @@ class Figures:
         quarters = np.array_split(np.asarray(self.memory_mb), 4)
         return float(np.median(quarters[3]) / np.median(quarters[1]) - 1.0)
 
-    def told(self) -> str:
+    def reported(self) -> str:
         curve = " ".join(f"{each:.0f}" for each in self.memory_mb[:: max(len(self.memory_mb) // 10, 1)])
         return (
             f"{self.wall_s:.1f} s, the outputs themselves {self.own_s:.1f} s: {self.share():.3f} (limit 0.9); memory "
@@ -185,7 +185,7 @@ def print_throughput(experiment: Experiment, folder: Path) -> None:
     """Print the cost of a batch of volumes and of one of fields in this process, and that of a command's start."""
     found = costs(experiment, folder)
     for name, figures in found.items():
-        print(f"{experiment.pairs()} pairs, {name}: {figures.told()}", flush=True)
+        print(f"{experiment.pairs()} pairs, {name}: {figures.reported()}", flush=True)
     each_s = found["volumes"].own_s / len(experiment.images)
     one_s = seconds_of(command(experiment, folder / "one", "--no-accelerate", images=experiment.images[:1]))
     print(f"a command for one frame of {each_s:.2f} s: {one_s:.1f} s", flush=True)

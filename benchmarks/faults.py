@@ -61,12 +61,12 @@ class Experiment:
 
     Attributes
     ----------
-    told : the rig file
+    reported : the rig file
     pictures : white, dark, board, pair_a, pair_b; what is missing is not given to the program
     full_counts : where the sensor saturates
     """
 
-    told: Tree
+    reported: Tree
     pictures: dict[str, Picture]
     full_counts: float
 
@@ -86,13 +86,13 @@ class Experiment:
 
     def with_value(self, keys: str, value: Callable[[Any], Any]) -> Experiment:
         """Return the experiment with another value of the rig file."""
-        told = copy.deepcopy(self.told)
+        reported = copy.deepcopy(self.reported)
         *sections, key = keys.split(".")
-        section = told
+        section = reported
         for each in sections:
             section = section[each]
         section[key] = value(section[key])
-        return replace(self, told=told)
+        return replace(self, reported=reported)
 
 
 @dataclass(frozen=True)
@@ -140,7 +140,7 @@ def on(name: str, change: Callable[[Picture], Picture]) -> Callable[[Experiment]
     return lambda e: e.changed(name, change)
 
 
-def told(keys: str, value: Callable[[Any], Any]) -> Callable[[Experiment], Experiment]:
+def reported(keys: str, value: Callable[[Any], Any]) -> Callable[[Experiment], Experiment]:
     """Return a wrong value of the rig file."""
     return lambda e: e.with_value(keys, value)
 
@@ -189,17 +189,17 @@ FAULTS = (
     Fault("board mirrored", "calibrate", on("board", flipped(1))),
     Fault("board moved by 0.3 px", "calibrate", on("board", moved(0.0, 0.3))),
     Fault("board moved by 3 px", "calibrate", on("board", moved(3.0, 0.0))),
-    Fault("board of other dots", "calibrate", told("board.dots", lambda dots: [dots[0] + 2, dots[1] + 1])),
-    Fault("board spacing 1.2 times", "calibrate", told("board.spacing_mm", times(1.2))),
-    Fault("magnification 0.9 times", "calibrate", told("camera.main_lens.magnification", times(0.9))),
-    Fault("pitch 1.1 times", "calibrate", told("camera.microlenses.pitch_mm", times(1.1))),
-    Fault("pixel 0.9 times", "calibrate", told("camera.sensor.pixel_um", times(0.9))),
-    Fault("aperture 0.6 times", "calibrate", told("camera.main_lens.aperture_mm", times(0.6))),
-    Fault("microlens focal length 0.7 times", "calibrate", told("camera.microlenses.focal_length_mm", times(0.7))),
+    Fault("board of other dots", "calibrate", reported("board.dots", lambda dots: [dots[0] + 2, dots[1] + 1])),
+    Fault("board spacing 1.2 times", "calibrate", reported("board.spacing_mm", times(1.2))),
+    Fault("magnification 0.9 times", "calibrate", reported("camera.main_lens.magnification", times(0.9))),
+    Fault("pitch 1.1 times", "calibrate", reported("camera.microlenses.pitch_mm", times(1.1))),
+    Fault("pixel 0.9 times", "calibrate", reported("camera.sensor.pixel_um", times(0.9))),
+    Fault("aperture 0.6 times", "calibrate", reported("camera.main_lens.aperture_mm", times(0.6))),
+    Fault("microlens focal length 0.7 times", "calibrate", reported("camera.microlenses.focal_length_mm", times(0.7))),
     Fault(
         "layout",
         "calibrate",
-        told("camera.microlenses.layout", lambda layout: "square" if layout == "hexagonal" else "hexagonal"),
+        reported("camera.microlenses.layout", lambda layout: "square" if layout == "hexagonal" else "hexagonal"),
     ),
     Fault("frame black", "frame", given_as("dark", "pair_a")),
     Fault("frame overexposed", "frame", on("pair_a", times(1e3))),
@@ -229,8 +229,8 @@ FAULTS = (
     Fault("images of two recordings", "pair", other_tracers),
     Fault("the same image twice", "pair", given_as("pair_a", "pair_b")),
     Fault("pair exchanged", "pair", exchanged("pair_a", "pair_b"), knowable=False),
-    Fault("index 5 % off", "calibrate", told("media.fluid", times(1.05)), knowable=False),
-    Fault("column axis", "calibrate", told("camera.sensor.column_axis", lambda _: "y"), knowable=False),
+    Fault("index 5 % off", "calibrate", reported("media.fluid", times(1.05)), knowable=False),
+    Fault("column axis", "calibrate", reported("camera.sensor.column_axis", lambda _: "y"), knowable=False),
     Fault("gamma", "frame", gamma, knowable=False),
 )
 
@@ -289,13 +289,13 @@ class Bench:
         shape = (sensor["rows"], sensor["columns"])
         names = ("white", "dark", *(["board"] if rig.board else []), "pair_a", "pair_b")
         pictures = {name: read_image(images / f"{name}.tif", shape).astype(np.float64) for name in names}
-        return cls(rig, Experiment(rig.told, pictures, 2.0 ** rig.true["simulation"]["bits"] - 1.0), folder)
+        return cls(rig, Experiment(rig.reported, pictures, 2.0 ** rig.true["simulation"]["bits"] - 1.0), folder)
 
     def run(self, experiment: Experiment, command: str, *arguments: str, config: Tree | None = None) -> Step:
         """Run a command whose arguments that begin with @ are pictures, left out with their option where missing."""
         for name, picture in experiment.pictures.items():
             write_tiff(self.folder / f"{name}.tif", picture.astype(np.uint16), overwrite=True)
-        (self.folder / "told.yaml").write_text(yaml.safe_dump(config or experiment.told))
+        (self.folder / "told.yaml").write_text(yaml.safe_dump(config or experiment.reported))
         words: list[str | Path] = []
         for word in arguments:
             if word.startswith("@") and word[1:] not in experiment.pictures:
@@ -331,11 +331,11 @@ class Bench:
 
     def few_voxels(self) -> Tree:
         """Return the rig file with a volume of few voxels, for what is only looked at."""
-        volume = self.good.told["volume"]
+        volume = self.good.reported["volume"]
         lens, depth = self.rig.lens_mm, volume["size_mm"][2] / 4.0
         few = {"shape_xyz": [8, 8, 4], "voxel_mm": [lens, lens, depth]}
         kept = {key: value for key, value in volume.items() if key != "size_mm"}
-        return self.good.told | {"volume": kept | few}
+        return self.good.reported | {"volume": kept | few}
 
 
 def print_faults(bench: Bench) -> None:

@@ -100,7 +100,7 @@ def by_field(
     gradient = field.gradient_at(nodes)
     divergence_mean2 = np.mean(np.einsum("nii->n", gradient) ** 2)
     share = float(np.sqrt(divergence_mean2 / np.mean(gradient**2)))
-    return judged(value, np.sqrt(variance), truth, seconds), share, dict(field.told())
+    return judged(value, np.sqrt(variance), truth, seconds), share, dict(field.reported())
 
 
 def bench_fields(arguments: Sequence[str] = ()) -> None:
@@ -130,7 +130,7 @@ def print_one(name: str, count: int, seed: int, nodes: NDArray[np.float64], dive
     tracks = tracks_of(flow, count, np.random.default_rng(seed), tuple(SIZE_MM), wrong_share=wrong)
     truth = true_displacement_mm(flow, nodes, tracks.dt_s)
     before = by_grid(tracks, nodes, truth)
-    after, share, told = by_field(tracks, nodes, truth, divergence)
+    after, share, reported = by_field(tracks, nodes, truth, divergence)
 
     def row(values: NDArray[np.float64], digits: int) -> str:
         return " ".join(f"{value:.{digits}f}" for value in values)
@@ -138,6 +138,6 @@ def print_one(name: str, count: int, seed: int, nodes: NDArray[np.float64], dive
     print(
         f"{name:12} {count:6} {seed}: {row(before.rms_voxel, 4)} -> {row(after.rms_voxel, 4)} "
         f"({row(after.rms_voxel / before.rms_voxel, 2)}); {row(after.covered, 3)}; {share:.4f}; "
-        f"{told['reduced_chi2']:.2f}; {before.seconds:.1f} -> {after.seconds:.1f}",
+        f"{reported['reduced_chi2']:.2f}; {before.seconds:.1f} -> {after.seconds:.1f}",
         flush=True,
     )

@@ -196,9 +196,9 @@ def _edit(chosen: random.Random, file: h5py.File, name: str) -> None:
     if item is None:
         return
     kind = chosen.randrange(4)
-    told = sorted(item.attrs)
-    if told and kind < 2:
-        attribute = chosen.choice(told)
+    reported = sorted(item.attrs)
+    if reported and kind < 2:
+        attribute = chosen.choice(reported)
         if attribute in ("DIMENSION_LIST", "REFERENCE_LIST"):
             return
         del item.attrs[attribute]
@@ -257,9 +257,9 @@ def whole_results() -> dict[str, bytes]:
     record = {"command": "test", "config": {"numbers": list(range(1500))}, "inputs": {}, "made_from": {}}
     with tempfile.TemporaryDirectory() as name:
         paths = {kind: Path(name) / kind for kind in ("volume", "particles", "weights")}
-        told = {"residual": np.ones(3), "excluded_pixels": 0, "support_voxels": 24}
+        reported = {"residual": np.ones(3), "excluded_pixels": 0, "support_voxels": 24}
         array = rng.random(grid.shape_zyx)
-        write_volume(paths["volume"], array, grid, FOCAL_POINT, provenance=record, attributes=told, overwrite=False)
+        write_volume(paths["volume"], array, grid, FOCAL_POINT, provenance=record, attributes=reported, overwrite=False)
         arrays = {unit: rng.random((9, 6) if unit == "covariance_mm2" else 9) for unit in UNITS[PARTICLES_FORMAT]}
         points = Points(rng.random((9, 3)), arrays, FOCAL_POINT, {"residual": 0.1, "refraction": "exact"}, record)
         write_points(paths["particles"], PARTICLES_FORMAT, points, overwrite=False)
@@ -361,7 +361,7 @@ def meant(reader: Reader, name: str) -> object:
 def fuzz(reader_name: str, cases: int, first: int, failures: Path) -> Counter[str]:
     """Read so many cases; print how far it is, keep the files of failures, and return how many fell into each class."""
     reader, counts, begun = READERS[reader_name], Counter[str](), time.monotonic()
-    told, said = begun, set[str]()
+    reported, said = begun, set[str]()
     with tempfile.TemporaryDirectory() as folder:
         for number in range(first, first + cases):
             name, content = case(reader, random.Random(number))
@@ -375,9 +375,9 @@ def fuzz(reader_name: str, cases: int, first: int, failures: Path) -> Counter[st
                     kept = failures / f"{reader_name}_{number}{reader.suffix}"
                     kept.write_bytes(content)
                     print(f"{reader_name} {number} ({name}): {kind} {words[:150]}, kept as {kept}", flush=True)
-            if time.monotonic() - told > 10.0:
-                told = time.monotonic()
-                rate = (number + 1 - first) / (told - begun)
+            if time.monotonic() - reported > 10.0:
+                reported = time.monotonic()
+                rate = (number + 1 - first) / (reported - begun)
                 print(
                     f"{reader_name}: {number + 1 - first} of {cases}, {rate:.0f} a second, {dict(counts)}", flush=True
                 )

@@ -102,5 +102,5 @@ def bench_links() -> None:
     print("case                                            right, worst   wrong, worst   expected wrong")
     for name, (case, with_light) in cases.items():
         right, wrong, expected = 100.0 * np.array([shares(case, seed, with_light) for seed in SEEDS]).T
-        told = f"{np.median(right):5.1f}  {right.min():5.1f}    {np.median(wrong):5.2f}  {wrong.max():5.2f}"
-        print(f"{name:46}  {told}    {np.median(expected):5.2f}", flush=True)
+        reported = f"{np.median(right):5.1f}  {right.min():5.1f}    {np.median(wrong):5.2f}  {wrong.max():5.2f}"
+        print(f"{name:46}  {reported}    {np.median(expected):5.2f}", flush=True)

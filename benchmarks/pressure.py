@@ -97,5 +97,5 @@ def bench_pressure() -> None:
         for step in STEPS_MM:
             for seed in range(SEEDS):
                 found = trial(flow, TRACERS, step, seed)
-                told = f"error {found.error_share:.3f}  stated {found.sigma_share:.3f}  covered {found.covered:.2f}"
-                print(f"{name:13s} {step:.2f} mm  seed {seed}  {told}", flush=True)
+                reported = f"error {found.error_share:.3f}  stated {found.sigma_share:.3f}  covered {found.covered:.2f}"
+                print(f"{name:13s} {step:.2f} mm  seed {seed}  {reported}", flush=True)

@@ -59,7 +59,7 @@ class DrawnRig:
 
     Attributes
     ----------
-    true, told : configurations: the one that is simulated, and the owner's
+    true, reported : configurations: the one that is simulated, and the owner's
     wrong : what the owner has wrong, empty where nothing
     board : whether there is a snapshot of a board
     dirt : specks on the sensor
@@ -69,7 +69,7 @@ class DrawnRig:
 
     number: int
     true: Tree
-    told: Tree
+    reported: Tree
     wrong: str
     board: bool
     dirt: int
@@ -139,11 +139,11 @@ def _drawn(rng: np.random.Generator, number: int, lenses: tuple[int, int] | None
         # No tracer meets a wall between the images, half of the way before and half after.
         _place_behind_a_wall(true, depth + deepest_mm, wall, to_focus, board)
     scene = {"flow": flow} | _scene(rng, true, density, lens_mm, depth_mm, field)
-    told, wrong = _told(rng, true)
+    reported, wrong = _told(rng, true)
     return DrawnRig(
         number,
         true | {"simulation": scene},
-        told,
+        reported,
         wrong,
         board,
         int(rng.integers(0, 30)),
@@ -266,13 +266,13 @@ def _flow(rng: np.random.Generator, lens_mm: float, depth_mm: float, size_mm: Se
 
 def _told(rng: np.random.Generator, true: Tree) -> tuple[Tree, str]:
     """Return the owner's configuration and what is wrong with it."""
-    told = copy.deepcopy(true)
+    reported = copy.deepcopy(true)
     if rng.random() >= WRONG_SHARE:
-        return told, ""
+        return reported, ""
     name = str(rng.choice([each for each in WRONG if each != "index" or true["media"]["fluid"] > 1.0]))
     keys, by = WRONG[name]
-    section = told
+    section = reported
     for key in keys[:-1]:
         section = section[key]
     section[keys[-1]] = round(section[keys[-1]] * (1.0 + by * float(rng.choice([-1.0, 1.0]))), 5)
-    return told, name
+    return reported, name

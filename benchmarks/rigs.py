@@ -132,9 +132,9 @@ def run_rig(rig: DrawnRig, keep: Path | None = None, volumes: bool = True) -> Ou
 
 def experiment(rig: DrawnRig, folder: Path, outcome: Outcome, volumes: bool) -> None:
     """Simulate, calibrate, measure by particles and by volumes, and judge, as far as the commands lead."""
-    true, told, images = folder / "true.yaml", folder / "told.yaml", folder / "images"
+    true, reported, images = folder / "true.yaml", folder / "told.yaml", folder / "images"
     true.write_text(yaml.safe_dump(rig.true))
-    told.write_text(yaml.safe_dump(rig.told))
+    reported.write_text(yaml.safe_dump(rig.reported))
     photograph_white(true, images)
     for what in ("board", "particles") if rig.board else ("particles",):
         step = run_command("simulate", what, true, "-o", images)
@@ -151,9 +151,9 @@ def experiment(rig: DrawnRig, folder: Path, outcome: Outcome, volumes: bool) -> 
     dark = ("--dark", images / "dark.tif")
     board = ("--board", images / "board.tif") if rig.board else ()
     calibration, weights = folder / "calibration.h5", folder / "weights.h5"
-    if not done("calibrate-snapshot", told, "--white", images / "white.tif", *dark, *board, "-o", calibration):
+    if not done("calibrate-snapshot", reported, "--white", images / "white.tif", *dark, *board, "-o", calibration):
         return
-    if not done("build-weights", told, "--calibration", calibration, "-o", weights):
+    if not done("build-weights", reported, "--calibration", calibration, "-o", weights):
         return
     pair = (images / "pair_a.tif", images / "pair_b.tif")
     by_particles = ("--solver", "particles", "--pairing", "ab", "-o", folder / "particles")
@@ -244,30 +244,30 @@ def verdict(outcome: Outcome) -> str:
     if not outcome.faults:
         return "worked"
     # That the data sheet is believed tells of nothing but a wrong data sheet.
-    told = [text for text in outcome.said if outcome.wrong_value or "[no-board]" not in text]
-    return "warned" if told else "silent"
+    reported = [text for text in outcome.said if outcome.wrong_value or "[no-board]" not in text]
+    return "warned" if reported else "silent"
 
 
 def row(outcome: Outcome) -> str:
     """Return what is printed of a rig."""
     figures = outcome.figures
 
-    def told(template: str, *names: str) -> str:
+    def reported(template: str, *names: str) -> str:
         return " ".join(template.format(figures.get(name, float("nan"))) for name in names)
 
     lines = [
         f"{outcome.number:3d} {outcome.verdict:8s} {outcome.seconds:5.0f} s  {outcome.name}",
-        f"      tracers {told('{:.0f}', 'tracers')}, found {told('{:.0f}', 'found')}, "
-        f"recall {told('{:.3f}', 'recall')}, precision {told('{:.3f}', 'precision')}, "
-        f"over the bound, lateral {told('{:.2f}', 'over_x', 'over_y')}, depth {told('{:.2f}', 'over_z')} "
-        f"(astray {told('{:.2f}', 'astray_x', 'astray_z')}), "
-        f"coverage {told('{:.2f}', 'coverage_x', 'coverage_y', 'coverage_z')}",
-        f"      slopes of {told('{:.0f}', 'tracks')} tracks {told('{:.3f}', 'slope_u', 'slope_v', 'slope_w')} "
-        f"(+- {told('{:.3f}', 'slope_u_sigma', 'slope_v_sigma', 'slope_w_sigma')}), of their grid "
-        f"{told('{:.3f}', 'grid_slope_u', 'grid_slope_v', 'grid_slope_w')}, of volumes "
-        f"{told('{:.3f}', 'volumes_slope_u', 'volumes_slope_v', 'volumes_slope_w')}, volumes' coverage "
-        f"{told('{:.2f}', 'volumes_coverage_u', 'volumes_coverage_v', 'volumes_coverage_w')} of "
-        f"{told('{:.2f}', 'volumes_sigma_known')}",
+        f"      tracers {reported('{:.0f}', 'tracers')}, found {reported('{:.0f}', 'found')}, "
+        f"recall {reported('{:.3f}', 'recall')}, precision {reported('{:.3f}', 'precision')}, "
+        f"over the bound, lateral {reported('{:.2f}', 'over_x', 'over_y')}, depth {reported('{:.2f}', 'over_z')} "
+        f"(astray {reported('{:.2f}', 'astray_x', 'astray_z')}), "
+        f"coverage {reported('{:.2f}', 'coverage_x', 'coverage_y', 'coverage_z')}",
+        f"      slopes of {reported('{:.0f}', 'tracks')} tracks {reported('{:.3f}', 'slope_u', 'slope_v', 'slope_w')} "
+        f"(+- {reported('{:.3f}', 'slope_u_sigma', 'slope_v_sigma', 'slope_w_sigma')}), of their grid "
+        f"{reported('{:.3f}', 'grid_slope_u', 'grid_slope_v', 'grid_slope_w')}, of volumes "
+        f"{reported('{:.3f}', 'volumes_slope_u', 'volumes_slope_v', 'volumes_slope_w')}, volumes' coverage "
+        f"{reported('{:.2f}', 'volumes_coverage_u', 'volumes_coverage_v', 'volumes_coverage_w')} of "
+        f"{reported('{:.2f}', 'volumes_sigma_known')}",
     ]
     if outcome.faults:
         lines.append(f"      wrong: {', '.join(outcome.faults)}")

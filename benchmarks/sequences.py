@@ -21,7 +21,7 @@ from lfpiv_cli.particles.rounds import first_pass
 from lfpiv_cli.particles.search import Particles, result
 from lfpiv_cli.synthetic.flows import Flow, advect, random_modes, square_duct, taylor_green
 from lfpiv_cli.tracks.candidates import Light, Seen, long_ones
-from lfpiv_cli.tracks.sequences import Ahead, SoFar, begun, expected_in, followed_further, scatter_in, states_at
+from lfpiv_cli.tracks.sequences import PartialTracks, Prediction, begun, expected_in, extended, scatter_in, states_at
 from lfpiv_cli.validation.volume import match
 
 SHAPE, VOLUME_XYZ, COUNT, FRAMES = (880, 880), (36, 36, 100), 830, 12
@@ -54,17 +54,19 @@ def print_sequence(bench: Bench, name: str, count: int, frames: int, seed: int) 
     images, true = photographs(bench, FLOWS[name], count, frames, np.random.default_rng(seed))
     began = time.process_time()
     search_mm = SEARCH_MM.get(name, 0.6)
-    found, so_far = followed(bench, images, search_mm)
-    print_figures(f"{name}, {count}, forwards", bench, found, so_far, true, time.process_time() - began)
+    found, partial = followed(bench, images, search_mm)
+    print_figures(f"{name}, {count}, forwards", bench, found, partial, true, time.process_time() - began)
     began = time.process_time()
-    found, so_far = followed_again(bench, images, found, so_far, search_mm)
-    print_figures(f"{name}, {count}, both ways", bench, found, so_far, true, time.process_time() - began)
+    found, partial = followed_again(bench, images, found, partial, search_mm)
+    print_figures(f"{name}, {count}, both ways", bench, found, partial, true, time.process_time() - began)
 
 
-def print_figures(name: str, bench: Bench, found: list[Seen], so_far: SoFar, true: Points, seconds: float) -> None:
+def print_figures(
+    name: str, bench: Bench, found: list[Seen], partial: PartialTracks, true: Points, seconds: float
+) -> None:
     """Print a line for each range of depths."""
     for distances in DISTANCES_MM:
-        figures = track_figures(bench, found, so_far, true, distances)
+        figures = track_figures(bench, found, partial, true, distances)
         if figures is None:
             continue
         text = "  ".join(f"{key} {value:.4f}" for key, value in figures.items())
@@ -94,37 +96,37 @@ def photographs(
     return images, np.array(true)
 
 
-def followed(bench: Bench, images: list[NDArray[np.float32]], search_mm: float) -> tuple[list[Seen], SoFar]:
+def followed(bench: Bench, images: list[NDArray[np.float32]], search_mm: float) -> tuple[list[Seen], PartialTracks]:
     """Return the particles of each frame, and how they belong together."""
     tasks = [bench.task(image) for image in images]
     own = [first_pass(task).particles for task in tasks[:2]]
     found = [_seen(result(tasks[k], second_pass(tasks[k], own[k], [own[1 - k]], search_mm))) for k in range(2)]
     scale = tasks[0].view.scale
-    so_far = followed_further(begun(found), found, search_mm, scale)
+    partial = extended(begun(found), found, search_mm, scale)
     for task in tasks[2:]:
-        state = find_predicted(task, _predicted(bench, so_far.ahead))
+        state = find_predicted(task, _predicted(bench, partial.ahead))
         found.append(_seen(result(task, first_pass(task) if state is None else state)))
-        so_far = followed_further(so_far, found, search_mm, scale)
-    return found, so_far
+        partial = extended(partial, found, search_mm, scale)
+    return found, partial
 
 
 def followed_again(
-    bench: Bench, images: list[NDArray[np.float32]], found: list[Seen], so_far: SoFar, search_mm: float
-) -> tuple[list[Seen], SoFar]:
+    bench: Bench, images: list[NDArray[np.float32]], found: list[Seen], partial: PartialTracks, search_mm: float
+) -> tuple[list[Seen], PartialTracks]:
     """Return the same after a second pass, in which each frame is expected by its tracks before and after it."""
-    confirmed, again = long_ones(so_far.found, SHORTEST), []
+    confirmed, again = long_ones(partial.found, SHORTEST), []
     for number, image in enumerate(images):
         task = bench.task(image)
         state = find_predicted(task, _predicted(bench, expected_in(confirmed, found, number)))
         again.append(_seen(result(task, first_pass(task) if state is None else state)))
-    so_far, scale = begun(again), bench.task(images[0]).view.scale
-    while so_far.last < len(again) - 1:
-        so_far = followed_further(so_far, again, search_mm, scale)
-    return again, so_far
+    partial, scale = begun(again), bench.task(images[0]).view.scale
+    while partial.last < len(again) - 1:
+        partial = extended(partial, again, search_mm, scale)
+    return again, partial
 
 
 def track_figures(
-    bench: Bench, found: list[Seen], so_far: SoFar, true: Points, distances_mm: tuple[float, float]
+    bench: Bench, found: list[Seen], partial: PartialTracks, true: Points, distances_mm: tuple[float, float]
 ) -> dict[str, float] | None:
     """Return recall, precision and errors in voxels of the places of confirmed tracks, this far from the focal plane.
 
@@ -138,7 +140,7 @@ def track_figures(
         return np.asarray(inside & (depth >= distances_mm[0]) & (depth < distances_mm[1]))
 
     inside = np.all((true > low) & (true < high), axis=2)
-    tracks = long_ones(so_far.found, SHORTEST)
+    tracks = long_ones(partial.found, SHORTEST)
     scatter, half = scatter_in(tracks, found)
     wanted = hit = shown = right = changed = links = 0
     errors, before = [], np.full(tracks.count, -1)
@@ -168,7 +170,7 @@ def _seen(found: Particles) -> Seen:
     return Seen(found.position_mm, symmetric(found.covariance_mm2), Light(found.light_counts, found.light_sigma_counts))
 
 
-def _predicted(bench: Bench, ahead: Ahead) -> Predicted:
+def _predicted(bench: Bench, ahead: Prediction) -> Predicted:
     camera, known = bench.calibration.camera(bench.sheet), np.isfinite(ahead.sigma_mm).all(axis=1)
     rows = np.column_stack([camera.to_image_axes(ahead.position_mm[known]), ahead.light[known]])
     return Predicted(rows, np.abs(camera.to_image_axes(ahead.sigma_mm[known])), ahead.light_sigma)

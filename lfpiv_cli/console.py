@@ -116,14 +116,14 @@ class Console:
             with tqdm(total=total, desc=label, file=sys.stderr, leave=False) as bar:
                 yield lambda steps: bar.update(steps) and None
         else:
-            begun = told = time.monotonic()
+            begun = reported = time.monotonic()
             done = 0
 
             def advance(steps: int) -> None:
-                nonlocal told, done
+                nonlocal reported, done
                 done, now = done + steps, time.monotonic()
-                if now - told >= SECONDS_BETWEEN_LINES and done:
-                    told, rate = now, done / (now - begun)
+                if now - reported >= SECONDS_BETWEEN_LINES and done:
+                    reported, rate = now, done / (now - begun)
                     left = _duration(max(total - done, 0) / rate)
                     self.say(f"{label}: {done} of {total} steps, {written(rate)} a second, {left} left")
 

@@ -44,7 +44,7 @@ def test_growth_is_that_of_the_last_quarter_over_the_second() -> None:
     figures = Figures(wall_s=10.0, own_s=9.5, memory_mb=memory, files=[5, 6])
     assert figures.growth() == pytest.approx(0.1)
     assert figures.share() == 0.95
-    assert "growth +10.0%" in figures.told()
+    assert "growth +10.0%" in figures.reported()
 
 
 @pytest.mark.slow
@@ -118,8 +118,8 @@ def test_faults_are_spoilt_experiments() -> None:
     pictures = {name: np.full((20, 24), 100.0) + k for k, name in enumerate(("dark", "pair_a", "pair_b"))}
     good = Experiment({"media": {"fluid": 1.33}}, pictures, 255.0)
     by_name = {fault.name: fault.spoil for fault in FAULTS}
-    assert by_name["index 5 % off"](good).told["media"]["fluid"] == pytest.approx(1.33 * 1.05)
-    assert good.told["media"]["fluid"] == 1.33
+    assert by_name["index 5 % off"](good).reported["media"]["fluid"] == pytest.approx(1.33 * 1.05)
+    assert good.reported["media"]["fluid"] == 1.33
     assert "dark" not in by_name["no dark"](good).pictures
     assert by_name["frame overexposed"](good).pictures["pair_a"].max() == 255.0
     assert by_name["pair exchanged"](good).pictures["pair_a"].max() == 102.0
@@ -191,11 +191,11 @@ def test_rigs_are_drawn_alike_and_from_the_whole_range() -> None:
 @pytest.mark.parametrize("number", range(12))
 def test_configs_of_drawn_rigs_are_accepted(number: int, tmp_path: Path) -> None:
     rig = draw(SEED, number)
-    for name, tree in (("true", rig.true), ("told", rig.told)):
+    for name, tree in (("true", rig.true), ("told", rig.reported)):
         path = tmp_path / f"{name}.yaml"
         path.write_text(json.dumps(tree))
         load_config(path)
-    assert (rig.told == {key: value for key, value in rig.true.items() if key != "simulation"}) == (rig.wrong == "")
+    assert (rig.reported == {key: value for key, value in rig.true.items() if key != "simulation"}) == (rig.wrong == "")
 
 
 def outcome_of(figures: dict[str, float], *steps: Step) -> Outcome:

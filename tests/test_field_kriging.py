@@ -156,7 +156,7 @@ def test_sources_are_found_where_there_are_some_and_as_is_chosen() -> None:
     points = places(80)
     samples = samples_of(points, turbulence(points))
     assert kriged_field(samples, "off").structure.potential_share == INDEPENDENT
-    assert kriged_field(samples, "free").told()["potential_share"] == 0.0
+    assert kriged_field(samples, "free").reported()["potential_share"] == 0.0
 
 
 @pytest.mark.thorough

@@ -15,7 +15,7 @@ from lfpiv_cli.grid import Scale
 from lfpiv_cli.synthetic.flows import Flow, advect, random_modes, rigid_rotation
 from lfpiv_cli.tracks.candidates import NO_TRACK, Candidates, Light, Seen, light_ratio, long_ones
 from lfpiv_cli.tracks.gridding import Structure, kriged, on_grid, structure_of
-from lfpiv_cli.tracks.sequences import PAST_FRAMES, REACH_FRAMES, SoFar, begun, expected_in, follow, followed_further
+from lfpiv_cli.tracks.sequences import PAST_FRAMES, REACH_FRAMES, PartialTracks, begun, expected_in, extended, follow
 from lfpiv_cli.tracks.tracking import (
     ALONE,
     LEAST_LIGHT_RATIO,
@@ -227,7 +227,7 @@ class Recorded:
     places: list[Floats]
     frames: list[Seen]
     numbers: list[Integers]
-    steps: list[SoFar]
+    steps: list[PartialTracks]
 
 
 def record(flow: Flow) -> Recorded:
@@ -242,10 +242,10 @@ def record(flow: Flow) -> Recorded:
         noisy = where[there] + rng.normal(0.0, NOISE_MM, (len(there), 3))
         frames.append(Seen(noisy, np.tile([*NOISE_MM**2, 0.0, 0.0, 0.0], (len(there), 1)), Light(light[there])))
         numbers.append(there)
-    so_far, steps = begun(frames), []
+    partial, steps = begun(frames), []
     for _ in frames[1:]:
-        so_far = followed_further(so_far, frames, SEARCH_MM, TABLE2_SCALE)
-        steps.append(so_far)
+        partial = extended(partial, frames, SEARCH_MM, TABLE2_SCALE)
+        steps.append(partial)
     return Recorded(places, frames, numbers, steps)
 
 
@@ -265,21 +265,21 @@ def turbulence() -> Recorded:
     return record(random_modes(0.075, seed=2))
 
 
-def ahead_of(recorded: Recorded, so_far: SoFar) -> tuple[Integers, Integers]:
+def ahead_of(recorded: Recorded, partial: PartialTracks) -> tuple[Integers, Integers]:
     """Return the true particles and the tracks of what is ahead: the last frame's, then those that it has lost."""
-    last, labels = so_far.last, so_far.found.labels
+    last, labels = partial.last, partial.found.labels
     lost = np.flatnonzero((labels[last - 1] != NO_TRACK) & ~np.isin(labels[last - 1], labels[last]))
-    lost = lost[: len(so_far.ahead.position_mm) - len(labels[last])]
+    lost = lost[: len(partial.ahead.position_mm) - len(labels[last])]
     return (
         np.concatenate([recorded.numbers[last], recorded.numbers[last - 1][lost]]),
         np.concatenate([labels[last], labels[last - 1][lost]]),
     )
 
 
-def errors_over_stated(recorded: Recorded, so_far: SoFar) -> Floats:
+def errors_over_stated(recorded: Recorded, partial: PartialTracks) -> Floats:
     """Return how far the particles are in the next frame from where they are expected, in stated errors."""
-    true, _ = ahead_of(recorded, so_far)
-    return (so_far.ahead.position_mm - recorded.places[so_far.last + 1][true]) / so_far.ahead.sigma_mm
+    true, _ = ahead_of(recorded, partial)
+    return (partial.ahead.position_mm - recorded.places[partial.last + 1][true]) / partial.ahead.sigma_mm
 
 
 @pytest.mark.thorough
@@ -287,7 +287,7 @@ def errors_over_stated(recorded: Recorded, so_far: SoFar) -> Floats:
 def test_stated_errors_of_forecasts_cover(flow: str, least: float, request: pytest.FixtureRequest) -> None:
     """In turbulence errors have longer tails than normal ones: 0.87 to 0.89 were measured."""
     recorded = request.getfixturevalue(flow)
-    ratio = np.concatenate([errors_over_stated(recorded, so_far) for so_far in recorded.steps[1:-1]])
+    ratio = np.concatenate([errors_over_stated(recorded, partial) for partial in recorded.steps[1:-1]])
     ratio = ratio[np.isfinite(ratio).all(axis=1)]
     assert len(ratio) > 1000
     covered = np.mean(np.abs(ratio) < 1.96, axis=0)
@@ -297,15 +297,15 @@ def test_stated_errors_of_forecasts_cover(flow: str, least: float, request: pyte
 @pytest.mark.thorough
 def test_what_one_frame_lost_is_still_ahead(vortex: Recorded) -> None:
     gone, expected, ratios = [], [], []
-    for so_far in vortex.steps[2:-1]:
-        last, numbers = so_far.last, vortex.numbers
-        true, _ = ahead_of(vortex, so_far)
+    for partial in vortex.steps[2:-1]:
+        last, numbers = partial.last, vortex.numbers
+        true, _ = ahead_of(vortex, partial)
         before = np.intersect1d(numbers[last - 1], numbers[last - 2])
         lost = np.setdiff1d(before[within(vortex.places[last + 1])[before]], numbers[last])
         rows = len(numbers[last]) + np.flatnonzero(np.isin(true[len(numbers[last]) :], lost))
         gone += lost.tolist()
         expected += true[rows].tolist()
-        ratios.append(errors_over_stated(vortex, so_far)[rows])
+        ratios.append(errors_over_stated(vortex, partial)[rows])
     assert len(gone) > 30
     assert len(expected) > 0.9 * len(gone)
     assert np.mean(np.abs(np.concatenate(ratios)) < 3.0) > 0.95
@@ -340,12 +340,12 @@ def test_a_frame_is_expected_by_what_is_before_and_after_it(vortex: Recorded) ->
 @pytest.mark.thorough
 def test_a_memory_of_few_frames_gives_the_same_tracks(turbulence: Recorded) -> None:
     recent = {0: turbulence.frames[0]}
-    so_far = begun(recent)
+    partial = begun(recent)
     for number in range(1, FRAMES):
         recent[number] = turbulence.frames[number]
         recent.pop(number - PAST_FRAMES - 2, None)
-        so_far = followed_further(so_far, recent, SEARCH_MM, TABLE2_SCALE)
-    few, every = long_ones(so_far.found, 3), follow(turbulence.frames, SEARCH_MM, 3, TABLE2_SCALE)
+        partial = extended(partial, recent, SEARCH_MM, TABLE2_SCALE)
+    few, every = long_ones(partial.found, 3), follow(turbulence.frames, SEARCH_MM, 3, TABLE2_SCALE)
     assert few.count == every.count > 200
     for one, other in zip((*few.labels, *few.probability), (*every.labels, *every.probability), strict=True):
         np.testing.assert_array_equal(one, other)

@@ -310,7 +310,7 @@ def test_velocities_on_circles_are_within_their_errors(rng: np.random.Generator,
     # 0.005 by chance; the circles are not all of one size, whose spread stands for all
     assert np.all(covered > 0.88)
     # where nothing bends, nothing is allowed for
-    assert scatter.twisting[1] < 1e-9
+    assert scatter.jerk[1] < 1e-9
     assert np.median(state.velocity_sigma[:, 1]) < 1.3 * 5e-4 / np.sqrt(np.sum(time**2))
 
 

@@ -291,7 +291,7 @@ def test_flows_that_splines_cannot_follow_are_kriged(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(stencils, "MOST_SPLINES", 66)
     samples, points = tracks(vortices, MANY, 18), inner(100, 18)
     kriged, free = fit_field(samples, LOW, HIGH), fitted(samples, "free")
-    assert kriged.told()["method"] == "kriging"
+    assert kriged.reported()["method"] == "kriging"
     assert off(kriged, vortices, points, None) < 0.5 * off(free, vortices, points, None)
 
 
@@ -300,7 +300,7 @@ def test_flows_that_splines_cannot_follow_are_kriged(monkeypatch: pytest.MonkeyP
 def test_few_samples_are_kriged_without_divergence(seed: int) -> None:
     samples, points = tracks(vortices, 150, seed, wrong=10), inner(200, seed)
     field = fit_field(samples, LOW, HIGH)
-    assert field.told()["method"] == "kriging"
+    assert field.reported()["method"] == "kriging"
     assert not field.probability[:10].any()
     assert np.mean(field.probability) > 0.9
     assert solenoidal_share(field, points) < 1e-6

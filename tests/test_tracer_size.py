@@ -87,7 +87,7 @@ def test_by_waves_diffusion_is_found_beside_the_diameter(
     # Of so many tracers, by the model that made them; what a model gets wrong is in the stated errors alone.
     assert found.lenses == pytest.approx(0.6, abs=0.01)
     assert found.held.diffusion_px == pytest.approx(0.42, abs=0.01)
-    assert found.held.told
+    assert found.held.reported
 
 
 @pytest.mark.thorough
@@ -290,8 +290,8 @@ def test_crowded_tracers_tell_diffusion_less_surely_and_others_what_is_usual(rng
     assert both.sigma_px == pytest.approx(many.sigma_px, rel=0.05)
     # What images do not tell is taken as usual.
     told, untold = together_of([forms(20, rng)]), together_of([forms(20, rng, sure=1e-3)])
-    assert told.told
-    assert not untold.told
+    assert told.reported
+    assert not untold.reported
     assert untold.diffusion_px == pytest.approx(USUAL_DIFFUSION_PX, abs=0.05)
     # Sizes of points are not below 0, and diffusion is then that of points.
     point = Forms(np.tile(1e4 * np.eye(2), (5, 1, 1)), np.tile(1e4 * np.array([-0.01, 0.04]), (5, 1)))
@@ -301,8 +301,8 @@ def test_crowded_tracers_tell_diffusion_less_surely_and_others_what_is_usual(rng
 
 
 def test_files_state_diffusion_and_its_error_where_it_is_not_given() -> None:
-    assert Diffusion(0.2, 0.31, 0.02, given=True, told=True).attributes() == {"diffusion_px": 0.2}
-    by_images = Diffusion(0.31, 0.31, 0.02, told=True)
+    assert Diffusion(0.2, 0.31, 0.02, given=True, reported=True).attributes() == {"diffusion_px": 0.2}
+    by_images = Diffusion(0.31, 0.31, 0.02, reported=True)
     assert by_images.attributes() == {"diffusion_px": 0.31, "diffusion_sigma_px": 0.02}
     assert Diffusion(USUAL_DIFFUSION_PX).attributes()["diffusion_sigma_px"] == 0.1
     size = TracerSize(0.05, 0.051, 0.002, True, by_images)
@@ -320,9 +320,9 @@ def test_files_state_diffusion_and_its_error_where_it_is_not_given() -> None:
 @pytest.mark.parametrize(
     ("diffusion", "codes"),
     [
-        (Diffusion(0.2, 0.21, 0.02, given=True, told=True), []),
-        (Diffusion(0.2, 0.31, 0.02, given=True, told=True), ["diffusion"]),
-        (Diffusion(0.31, 0.31, 0.02, told=True), []),
+        (Diffusion(0.2, 0.21, 0.02, given=True, reported=True), []),
+        (Diffusion(0.2, 0.31, 0.02, given=True, reported=True), ["diffusion"]),
+        (Diffusion(0.31, 0.31, 0.02, reported=True), []),
         (Diffusion(0.31, 0.31, 0.09), ["diffusion-unknown"]),
         (Diffusion(USUAL_DIFFUSION_PX), ["diffusion-unknown"]),
         # What is given is used where the images do not tell.

@@ -172,7 +172,7 @@ class LensImages:
         freedom = system.alike / max(system.alike - (0.5 * len(unknowns) + 1.0), 1.0)
         covariance = freedom * (inverse @ (system.pull.T @ system.pull) @ inverse + inverse)
         places, known = [], system.alike > FEWEST_PARTS
-        for lever in _levers(part_middles()[system.told >= WELL_LIT * system.told.max()])[..., : len(unknowns)]:
+        for lever in _levers(part_middles()[system.reported >= WELL_LIT * system.reported.max()])[..., : len(unknowns)]:
             shift, spread = lever @ unknowns, lever @ covariance @ lever.T
             along = shift / max(float(np.hypot(*shift)), TINY)
             places.append(Place(shift, float(np.sqrt(along @ spread @ along)) if known else np.inf))
@@ -280,14 +280,14 @@ class System(NamedTuple):
     amount: Floats
 
     @property
-    def told(self) -> Floats:
+    def reported(self) -> Floats:
         """(parts,) how much each part tells of the shift."""
         return np.asarray(np.trace(self.matrix[:, :2, :2], axis1=1, axis2=2))
 
     @property
     def alike(self) -> float:
         """How many parts that tell as much as each other would tell what they do."""
-        return float(self.told.sum() ** 2 / np.sum(self.told**2))
+        return float(self.reported.sum() ** 2 / np.sum(self.reported**2))
 
 
 def _moved(pattern: Floats, shift: Floats) -> tuple[Floats, Floats]:

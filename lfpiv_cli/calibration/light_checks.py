@@ -220,7 +220,7 @@ def white_notices(white: Floats, fit: LatticeFit, width: float, sheet_width: flo
             f"at most {100 * LARGEST_DIFFERENCE:.0f} % under uniform light: it looks like a picture of a scene"
         )
         yield Notice("white-not-uniform", WHITE, text, IS_IT_WHITE, difference, f"at most {LARGEST_DIFFERENCE:g}")
-    told = None if sheet_width is None else min(sheet_width, 1.0)
+    reported = None if sheet_width is None else min(sheet_width, 1.0)
     if width < NARROWEST_LENS_IMAGE:
         text = (
             f"its lens images are {width:.2f} of the pitch wide, at least {NARROWEST_LENS_IMAGE:g} is needed for the "
@@ -228,13 +228,13 @@ def white_notices(white: Floats, fit: LatticeFit, width: float, sheet_width: flo
         )
         remedy = "give a second --white, taken with the aperture of the measurements"
         yield Notice("white-stopped-down", WHITE, text, remedy, width, f"at least {NARROWEST_LENS_IMAGE:g}")
-    elif told is not None and not 1.0 / WIDTH_TOLERANCE <= width / told <= WIDTH_TOLERANCE:
+    elif reported is not None and not 1.0 / WIDTH_TOLERANCE <= width / reported <= WIDTH_TOLERANCE:
         text = (
-            f"the lens images of the white image are {width:.2f} of the pitch wide, {told:.2f} by the "
+            f"the lens images of the white image are {width:.2f} of the pitch wide, {reported:.2f} by the "
             "data sheet's apertures"
         )
         remedy = "correct aperture_mm or f_number, or take the white image with the aperture of the measurements"
-        expected = f"{written(told)} within a factor of {WIDTH_TOLERANCE:g}"
+        expected = f"{written(reported)} within a factor of {WIDTH_TOLERANCE:g}"
         yield Notice("aperture-not-as-told", "camera.main_lens.aperture_mm", text, remedy, width, expected)
 
 

@@ -105,10 +105,10 @@ def image_distance_notices(fit: LatticeFit, camera: Camera) -> list[Notice]:
         difference = abs(found[0] - sheet)
         if difference <= max(IMAGE_DISTANCE_TOLERANCE * sheet, IMAGE_DISTANCE_SIGMAS * found[1]):
             return []
-    told = "no image distance" if found is None else f"an image distance of {written(found[0], 4)} mm"
+    reported = "no image distance" if found is None else f"an image distance of {written(found[0], 4)} mm"
     ratio = 0.0 if found is None else found[0] / real_lens(camera).focal_length_mm + camera.magnification
     expected = "an infinite one" if telecentric else f"{written(sheet, 4)} mm"
-    text = f"the pitch of the lens images tells {told}, the data sheet {expected}"
+    text = f"the pitch of the lens images tells {reported}, the data sheet {expected}"
     remedy = (
         "correct what is off of microlenses.pitch_mm, sensor.pixel_um, sensor.microlens_distance_mm and main_lens"
         + (f" (pupil_ratio {written(ratio)} if all else is right)" if ratio > 0.0 else "")
@@ -195,22 +195,22 @@ def check_f_numbers(camera: Camera) -> None:
     ------
     ConfigError
     """
-    ratio, told = _f_numbers(camera)
+    ratio, reported = _f_numbers(camera)
     if ratio > LARGEST_F_RATIO:
         raise ConfigError(
-            f"camera.main_lens.aperture_mm: {told}; at most a factor of {LARGEST_F_RATIO:g} may be "
+            f"camera.main_lens.aperture_mm: {reported}; at most a factor of {LARGEST_F_RATIO:g} may be "
             "between them; check the apertures, the focal lengths and microlens_distance_mm"
         )
 
 
 def f_number_notices(camera: Camera) -> list[Notice]:
     """Return what speaks against the f-numbers of main lens and microlenses."""
-    ratio, told = _f_numbers(camera)
+    ratio, reported = _f_numbers(camera)
     if ratio <= LARGE_F_RATIO:
         return []
     turned = "stop the lens down" if camera.lens_image_width > 1.0 else "open it"
     remedy = f"correct the aperture (f_number is F_m / p_m), or {turned} until lens images just touch"
-    return [Notice("f-numbers", "camera.main_lens.aperture_mm", told, remedy, ratio, f"at most {LARGE_F_RATIO:g}")]
+    return [Notice("f-numbers", "camera.main_lens.aperture_mm", reported, remedy, ratio, f"at most {LARGE_F_RATIO:g}")]
 
 
 def _f_numbers(camera: Camera) -> tuple[float, str]:

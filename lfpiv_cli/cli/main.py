@@ -58,9 +58,9 @@ def end_by_signals() -> None:
     if sys.platform == "win32":
         return
     # Answered from a thread of its own: Python itself hears of a signal when a compiled call has returned.
-    heard, told = os.pipe()
-    os.set_blocking(told, False)
-    signal.set_wakeup_fd(told, warn_on_full_buffer=False)
+    heard, reported = os.pipe()
+    os.set_blocking(reported, False)
+    signal.set_wakeup_fd(reported, warn_on_full_buffer=False)
     # What is sent to a forked process is none of this one's.
     os.register_at_fork(after_in_child=lambda: signal.set_wakeup_fd(-1))
 
@@ -202,9 +202,9 @@ def cli(context: click.Context, **before: Any) -> None:
     """
     # Pictures are drawn into files, on no screen.
     os.environ.pop(SCREEN, None)
-    told = os.environ.get(THREADS)
-    if told is not None and not (told.strip().isdecimal() and int(told) > 0):
-        raise UsageError(f"{THREADS} is {told!r}, expected a number of threads from 1 on, or that it is not set")
+    reported = os.environ.get(THREADS)
+    if reported is not None and not (reported.strip().isdecimal() and int(reported) > 0):
+        raise UsageError(f"{THREADS} is {reported!r}, expected a number of threads from 1 on, or that it is not set")
     context.default_map = {str(context.invoked_subcommand): {name: value for name, value in before.items() if value}}
 
 

@@ -153,9 +153,9 @@ def most_probable(
     for _ in range(ROUNDS):
         before = bounded + sum(weight * parts[name] for name, weight in expected.weights.items())
         tell = partial(_told, expected, parts, before, _inverse(before)[0])
-        told = in_threads(tell, list(zip(boxes, beliefs, strict=True)))
-        had, decided = (np.sum([each[number] for each in told], axis=0) for number in range(2))
-        beliefs = [each[2] for each in told]
+        reported = in_threads(tell, list(zip(boxes, beliefs, strict=True)))
+        had, decided = (np.sum([each[number] for each in reported], axis=0) for number in range(2))
+        beliefs = [each[2] for each in reported]
         change = np.maximum(decided, SMALLEST_SHARE * had) / np.maximum(had, np.finfo(np.float64).tiny)
         change[: len(names)] = np.clip(change[: len(names)], 1.0 / LARGEST_STEP, LARGEST_STEP)
         scales = np.sqrt(np.clip(1.0 / change[len(names) :], 1.0 / LARGEST_STEP, LARGEST_STEP))
@@ -183,7 +183,7 @@ def most_probable(
         expected, last = onward, step
         if settled:
             break
-    return expected, np.median(np.concatenate([each[3] for each in told]), axis=0)
+    return expected, np.median(np.concatenate([each[3] for each in reported]), axis=0)
 
 
 def divergence_weight(expected: Expectation, lattice: Lattice, times: float) -> float:

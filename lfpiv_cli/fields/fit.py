@@ -194,7 +194,7 @@ class KrigedField:
         ]
         return np.concatenate(parts)
 
-    def told(self) -> dict[str, Any]:
+    def reported(self) -> dict[str, Any]:
         """Return how the field was fitted: figures with their units in their names."""
         return {
             "method": "kriging",

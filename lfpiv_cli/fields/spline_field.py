@@ -64,7 +64,7 @@ class SplineField:
         """Return displacements and their variances (m, 3)."""
         return self.value_at(points_mm), self.variance_at(points_mm)
 
-    def told(self) -> dict[str, Any]:
+    def reported(self) -> dict[str, Any]:
         """Return how the field was fitted: figures with their units in their names."""
         return {
             "method": "splines",

@@ -16,7 +16,7 @@ from lfpiv_cli.files.hdf5 import read_whole, replace_provenance
 from lfpiv_cli.files.images import count_pages, frames
 from lfpiv_cli.files.inputs import split_part
 from lfpiv_cli.files.pairing import Seen
-from lfpiv_cli.files.provenance import bear_alike, differences, earlier_record, without_warnings
+from lfpiv_cli.files.provenance import differences, earlier_record, same_result, without_warnings
 
 VTKHDF_SUFFIX = ".vtkhdf"
 # So many things that have changed are named, and all others counted.
@@ -163,7 +163,7 @@ def state_of(target: Target) -> State:
         if carried is not None and without_warnings(carried) == made:
             states.append(State.COMPLETE)
         else:
-            alike = carried is not None and bear_alike(carried, made)
+            alike = carried is not None and same_result(carried, made)
             states.append(State.BEARS_ALIKE if alike else State.OTHER)
     return max(states)
 
@@ -199,10 +199,10 @@ def pending(
                 for each in target.paths
                 if each.exists() and state_of(replace(target, path=each, beside=())) is found
             )
-            told = differences(read_whole(path) or {}, target.record)
-            if len(told) > MOST_DIFFERENCES:
-                told[MOST_DIFFERENCES:] = [f"{len(told) - MOST_DIFFERENCES} more"]
-            changed = f" ({'; '.join(told)})" if told else ""
+            reported = differences(read_whole(path) or {}, target.record)
+            if len(reported) > MOST_DIFFERENCES:
+                reported[MOST_DIFFERENCES:] = [f"{len(reported) - MOST_DIFFERENCES} more"]
+            changed = f" ({'; '.join(reported)})" if reported else ""
             what = "keeps it, as it depends on none of that" if found is State.BEARS_ALIKE else "makes it anew"
             raise OutputExistsError(
                 f"{path}: exists and was made from other inputs or settings{changed}; --overwrite {what}"

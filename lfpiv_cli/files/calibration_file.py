@@ -125,15 +125,15 @@ def calibration_of(tree: Mapping[str, Any]) -> Calibration:
         fit["cubic_used"] = bool(fit["cubic_used"])
         ray_fit, scene = None, None
         if tree.get("dlfc"):
-            told = _checked(tree["dlfc"], OF_RAY_FIT)
-            rays = PolynomialRays(**_checked(told.pop("rays"), OF_RAYS))
+            reported = _checked(tree["dlfc"], OF_RAY_FIT)
+            rays = PolynomialRays(**_checked(reported.pop("rays"), OF_RAYS))
             if not 0 < len(rays.exponents) == len(rays.coefficients_mm):
                 raise ValueError(f"{len(rays.exponents)} terms of {len(rays.coefficients_mm)} coefficients")
             if not np.isin(rays.exponents, range(LARGEST_DEGREE + 1)).all() or rays.degree > LARGEST_DEGREE:
                 raise ValueError(f"polynomials with exponents up to {rays.exponents.max()}")
             if not np.isfinite(rays.coefficients_mm).all() or not np.all(rays.scale_mm > 0.0):
                 raise ValueError("polynomials with coefficients that are no numbers")
-            ray_fit = RayFit(rays=rays, **told)
+            ray_fit = RayFit(rays=rays, **reported)
         if tree.get("scene"):
             scene = ScenePose(**_checked(tree["scene"], OF_SCENE))
             if not all(np.isfinite(getattr(scene, name)).all() for name in OF_SCENE):

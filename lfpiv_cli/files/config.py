@@ -278,12 +278,12 @@ class Config:
         points = board.dots if board.squares is None else (board.squares[0] - 1, board.squares[1] - 1)
         if points is None:
             raise ValueError("board.dots or board.squares is missing")
-        told = board.model_dump(exclude={"dots", "squares"})
-        told |= {name: told[name] or 0.0 for name in ("dot_diameter_mm", "marker_mm")}
+        reported = board.model_dump(exclude={"dots", "squares"})
+        reported |= {name: reported[name] or 0.0 for name in ("dot_diameter_mm", "marker_mm")}
         return Rig(
             camera,
             media,
-            BoardGeometry(dots=points, **told),
+            BoardGeometry(dots=points, **reported),
             None if channel is None else Channel(**channel.model_dump(exclude={"no_slip"})),
             self.reconstruction.wave_light(),
         )

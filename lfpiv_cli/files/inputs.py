@@ -103,8 +103,8 @@ def reason(error: BaseException) -> str:
     """Return the cause of an error in one line: the system's words where it has a number, else its first line."""
     if isinstance(error, OSError) and error.errno:
         return os.strerror(error.errno)
-    if (told := NUMBER_IN_HDF5.search(str(error))) is not None:
-        return os.strerror(int(told[1]))
+    if (reported := NUMBER_IN_HDF5.search(str(error))) is not None:
+        return os.strerror(int(reported[1]))
     lines = str(error).strip().splitlines()
     return lines[0] if lines else type(error).__name__
 

@@ -145,7 +145,7 @@ class _Found:
     def leave_out(self, numbers: Iterable[int], why: str) -> None:
         self.left_out += [Notice("frame-unpaired", self.names[number], why, REMEDY) for number in numbers]
 
-    def told(self, how: Pairing) -> Pairs:
+    def reported(self, how: Pairing) -> Pairs:
         return Pairs(tuple(self.pairs), tuple(self.left_out), tuple(self.notices), how == "ab")
 
 
@@ -183,12 +183,12 @@ def pair_frames(frames: Sequence[Seen], how: Pairing, by: str | None = None) -> 
             remedy = "number them, so that a missing one is seen"
             found.notices.append(Notice("paired-by-order", frames[0].name, text, remedy))
             found.leave_out([count - 1] if how == "ab" and count % 2 else [], "no frame comes after it")
-        return found.told(how)
+        return found.reported(how)
     placed = {number: place for number, place in zip(once, places, strict=True) if place is not None}
     missed = NO_PLACE if by is None else f"its name is not of the form {by}"
     found.leave_out((number for number in once if number not in placed), missed)
     (_pair if how == "ab" else _follow)(placed, found)
-    return found.told(how)
+    return found.reported(how)
 
 
 def in_order(frames: Sequence[Seen]) -> tuple[list[int], list[Notice]]:

@@ -78,22 +78,24 @@ def read_particles(path: Path) -> Particles:
     except Exception as error:  # a damaged archive can raise anything in zipfile and NumPy
         raise InputError(f"{path}: not a list of particles: {reason(error)}") from error
     position, velocity = arrays.pop("position_mm"), arrays.pop("velocity_mm_s")
-    told = arrays
+    reported = arrays
     if position.ndim != 2 or position.shape[1:] != (3,) or position.shape != velocity.shape or not position.size:
         raise InputError(f"{path}: positions {position.shape} and velocities {velocity.shape}, expected twice (n, 3)")
-    told.setdefault("brightness", np.ones(len(position)))
-    frames = told["frame_position_mm"].shape[:1] if "frame_position_mm" in told else ()
-    for name, array in told.items():
+    reported.setdefault("brightness", np.ones(len(position)))
+    frames = reported["frame_position_mm"].shape[:1] if "frame_position_mm" in reported else ()
+    for name, array in reported.items():
         of_frames = frames if name.startswith("frame") else ()
         expected = of_frames + (position.shape if name == "frame_position_mm" else position.shape[:1])
         if array.shape != expected:
             raise InputError(f"{path}: {name} {array.shape} for {len(position)} particles, expected {expected}")
-    if not all((np.abs(values) < LARGEST_VALUE).all() for values in (position, velocity, *told.values())):
+    if not all((np.abs(values) < LARGEST_VALUE).all() for values in (position, velocity, *reported.values())):
         raise InputError(
             f"{path}: a position, velocity, brightness or diameter is not a finite number below "
             f"{written(LARGEST_VALUE)}"
         )
-    return Particles(position, velocity / MM_PER_M, told["brightness"], *(told.get(name) for name in OPTIONAL[1:]))
+    return Particles(
+        position, velocity / MM_PER_M, reported["brightness"], *(reported.get(name) for name in OPTIONAL[1:])
+    )
 
 
 def _read_array(stored: zipfile.ZipFile, name: str, largest: int) -> NDArray[np.float64]:

@@ -169,14 +169,14 @@ def even_step_s(steps_s: Sequence[float | None], names: Sequence[str]) -> float 
     ------
     InputError : frames are not in the order in which they were taken, or not evenly spaced in time
     """
-    told = [step for step in steps_s if step is not None]
-    if not told or len(told) < len(steps_s):
+    reported = [step for step in steps_s if step is not None]
+    if not reported or len(reported) < len(steps_s):
         return None
-    mean_s, span = sum(told) / len(told), f"{names[0]} to {names[-1]}: the recording's times"
-    if min(told) <= 0.0:
+    mean_s, span = sum(reported) / len(reported), f"{names[0]} to {names[-1]}: the recording's times"
+    if min(reported) <= 0.0:
         raise InputError(f"{span} do not increase from frame to frame; give them in order, or --dt-s")
-    if max(told) - min(told) > UNEVEN * mean_s:
-        raise InputError(f"{span} are {min(told):g} to {max(told):g} s apart, expected even steps; give --dt-s")
+    if max(reported) - min(reported) > UNEVEN * mean_s:
+        raise InputError(f"{span} are {min(reported):g} to {max(reported):g} s apart, expected even steps; give --dt-s")
     return mean_s
 
 
@@ -219,7 +219,7 @@ def _sha256_of_all(folder: Path, states: Sequence[tuple[str, int, int]]) -> str:
     return hashlib.sha256(os.fsencode("".join(lines))).hexdigest()
 
 
-def bear_alike(first: Mapping[str, Any], second: Mapping[str, Any]) -> bool:
+def same_result(first: Mapping[str, Any], second: Mapping[str, Any]) -> bool:
     """Return whether two records are of the same result: alike but for settings that it does not depend on."""
     try:
         return _bearing(first, first["made_from"]) == _bearing(second, second["made_from"])
@@ -243,7 +243,7 @@ def _bearing(made: Mapping[str, Any], earlier: Mapping[str, Any]) -> dict[str, A
 def differences(carried: Mapping[str, Any], made: Mapping[str, Any]) -> list[str]:
     """Return in words what has changed since a result was made, by the record that it carries and that it would get."""
     before, now = _facts(carried), _facts(made)
-    told = []
+    reported = []
     for name in dict.fromkeys([*now, *before]):
         was, is_now = before.get(name), now.get(name)
         if isinstance(was, dict) or isinstance(is_now, dict):  # an input, which is no plain value
@@ -251,9 +251,9 @@ def differences(carried: Mapping[str, Any], made: Mapping[str, Any]) -> list[str
         else:
             words = f"{name} was {was}, is {is_now}".replace("None", "not given")
         if was != is_now:
-            told.append(words if len(words) <= LONGEST_CHANGE else f"{name} has changed")
+            reported.append(words if len(words) <= LONGEST_CHANGE else f"{name} has changed")
     configs = [made.get("inputs", {}).get("config") for made in (carried, made)]
-    return told or (["the config is another file, which says the same"] if configs[0] != configs[1] else [])
+    return reported or (["the config is another file, which says the same"] if configs[0] != configs[1] else [])
 
 
 def _facts(made: Mapping[str, Any]) -> dict[str, Any]:

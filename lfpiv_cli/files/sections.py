@@ -127,10 +127,10 @@ class _Face(Section):
         ------
         ConfigError : heights that are no grid
         """
-        told = {name: getattr(self, name) for name in type(self).model_fields if name not in ("behind", "file")}
-        if isinstance(told.get("axis"), str):
-            told["axis"] = DIRECTIONS[told["axis"]]
-        return Face(SURFACES[told.pop("kind")](**told), self.index_behind(media))
+        reported = {name: getattr(self, name) for name in type(self).model_fields if name not in ("behind", "file")}
+        if isinstance(reported.get("axis"), str):
+            reported["axis"] = DIRECTIONS[reported["axis"]]
+        return Face(SURFACES[reported.pop("kind")](**reported), self.index_behind(media))
 
 
 class PlaneFace(_Face):

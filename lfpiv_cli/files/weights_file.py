@@ -237,8 +237,8 @@ def open_weights(path: Path | str) -> WeightsFile:
     tree, provenance = read_tree(path, FORMAT, VERSION)
     try:
         camera = _camera(_stored(StoredCamera, tree["camera"]))
-        told = _stored(StoredGrid, tree["grid"])
-        grid, padding = Grid(told.shape_xyz, told.spacing_mm, told.origin_mm), told.padding_xyz
+        reported = _stored(StoredGrid, tree["grid"])
+        grid, padding = Grid(reported.shape_xyz, reported.spacing_mm, reported.origin_mm), reported.padding_xyz
         voxels = math.prod(grid.padded(padding).shape_xyz)
         if BYTES_A_VOXEL * voxels > physical_memory():
             raise ValueError(f"{voxels} voxels do not fit into memory")
@@ -394,12 +394,12 @@ def _source(tree: dict[str, Any], calibration: Calibration | None) -> Source:
         numbered = [dict(tree["faces"][str(k)]) for k in range(len(tree["faces"]))]  # from the camera on
         faces = tuple(face | {"behind": face.pop("index")} for face in numbered)
         tree = tree | {"faces": faces, "refraction": "exact"}
-    told = _stored(StoredSpace, tree)
-    media = Media(told.air, told.window, told.fluid)
-    if told.faces is not None:
-        return scene_of(told.faces, media)
-    window = None if told.window_face is None else Window(**told.window_face.model_dump())
-    return ObjectSpace(media, window, told.refraction, told.method)
+    reported = _stored(StoredSpace, tree)
+    media = Media(reported.air, reported.window, reported.fluid)
+    if reported.faces is not None:
+        return scene_of(reported.faces, media)
+    window = None if reported.window_face is None else Window(**reported.window_face.model_dump())
+    return ObjectSpace(media, window, reported.refraction, reported.method)
 
 
 def _axis_weights(
@@ -439,14 +439,14 @@ def _table(
     return start.astype(np.int64), place.astype(np.int32), share.astype(np.float32)
 
 
-def _camera(told: StoredCamera) -> Camera:
+def _camera(reported: StoredCamera) -> Camera:
     """Return the camera of a weights file, if its lens images can be told apart and its images fit into memory."""
-    if BYTES_A_PIXEL * told.columns * told.rows > physical_memory():
-        raise ValueError(f"{told.columns} x {told.rows} pixels do not fit into memory")
-    lattice = Lattice(np.array(told.lattice_origin_mm), np.array(told.lattice_basis_mm), told.layout)
+    if BYTES_A_PIXEL * reported.columns * reported.rows > physical_memory():
+        raise ValueError(f"{reported.columns} x {reported.rows} pixels do not fit into memory")
+    lattice = Lattice(np.array(reported.lattice_origin_mm), np.array(reported.lattice_basis_mm), reported.layout)
     if not lattice.cell_area >= LEAST_SINE * math.prod(lattice.pitch):
-        raise ValueError(f"the lattice's basis {told.lattice_basis_mm} is of no array of lenses")
-    camera = Camera(lattice=lattice, **told.model_dump(exclude={"layout", "lattice_origin_mm", "lattice_basis_mm"}))
+        raise ValueError(f"the lattice's basis {reported.lattice_basis_mm} is of no array of lenses")
+    camera = Camera(lattice=lattice, **reported.model_dump(exclude={"layout", "lattice_origin_mm", "lattice_basis_mm"}))
     pitch_px = camera.lattice.pitch / camera.pixel_mm
     if not (pitch_px.min() >= FEWEST_PIXELS_A_LENS and pitch_px.max() <= MOST_PIXELS_A_LENS):
         raise ValueError(f"its lens images are {pitch_px.tolist()} px apart")

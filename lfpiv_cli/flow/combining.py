@@ -82,8 +82,8 @@ def combine(first: VectorField, second: VectorField) -> Combined:
     lengths = [np.array([field.grid.spacing_mm, field.grid.origin_mm, field.voxel_mm]) for field in fields]
     alike = (first.grid.shape_xyz, first.dt_s) == (second.grid.shape_xyz, second.dt_s)
     if not alike or np.abs(lengths[0] - lengths[1]).max() > SAME_PLACE_VOXEL * min(first.voxel_mm):
-        told = [f"{field.grid}, voxels of {field.voxel_mm} mm, {field.dt_s} s" for field in fields]
-        raise InputError(f"the two vector fields differ in grid, voxels or time: {told[0]} and {told[1]}")
+        reported = [f"{field.grid}, voxels of {field.voxel_mm} mm, {field.dt_s} s" for field in fields]
+        raise InputError(f"the two vector fields differ in grid, voxels or time: {reported[0]} and {reported[1]}")
     masked = (first.flag == MASKED) | (second.flag == MASKED)
     values = np.stack([field.displacement_voxel for field in fields])
     stated, ranks = np.full(values.shape, np.nan), np.full((2, *masked.shape), NONE)

@@ -150,11 +150,11 @@ def _measured(name: str, case: Case, work: Work) -> dict[str, Any]:
     folder, quiet = work.folder / f"measured_{name}", Console(quiet=True)
     pair = [work.folder / case.images / image for image in frame_names(2)]
     options = ReconstructOptions(dark=work.folder / "still" / "dark.tif", **case.options)
-    told = reconstruct_files(work.folder / "weights.h5", pair, folder, options, overwrite=True, console=quiet)
+    reported = reconstruct_files(work.folder / "weights.h5", pair, folder, options, overwrite=True, console=quiet)
     volumes = [folder / f"{image.stem}.vtkhdf" for image in pair]
     correlate_files(volumes, work.folder / f"{name}.vtkhdf", overwrite=True, console=quiet)
     figures = near_wall(_read(work, name), simulated_duct(work.folder / "clean.yaml"))
-    return figures | {"excluded_pixels": told["excluded_pixels"]}
+    return figures | {"excluded_pixels": reported["excluded_pixels"]}
 
 
 def _read(work: Work, name: str) -> Measured:
@@ -227,11 +227,12 @@ def _drawings(work: Work, methods: Mapping[str, Measured], duct: Duct) -> tuple[
 
 def _text(size: ChannelSize, diameters: list[float], count: int) -> tuple[str, ...]:
     return (
-        f"A short piece of the channel ({size.told()}) with {count} bubbles of {diameters[0]:g} to {diameters[1]:g} mm "
-        "on the wall at the high end of x/D: bright discs with a saturated core that do not move between the two "
-        "images. Saturated pixels are left out in any case; what spoils the velocities is the bright rim, which light "
-        "gives to voxels all along its line of sight and which stands still. `lfpiv reconstruct --mask still` finds "
-        "such pixels from the images alone, here the two of the pair, without knowing where the bubbles are; "
+        f"A short piece of the channel ({size.reported()}) with {count} bubbles of {diameters[0]:g} to "
+        f"{diameters[1]:g} mm on the wall at the high end of x/D: bright discs with a saturated core that do not move "
+        "between the two images. Saturated pixels are left out in any case; what spoils the velocities is the bright "
+        "rim, which light gives to voxels all along its line of sight and which stands still. `lfpiv reconstruct "
+        "--mask still` finds such pixels from the images alone, here the two of the pair, without knowing where the "
+        "bubbles are; "
         "`--background minimum` takes off what both images have in common.",
         "Left out are pixels that in all images are brighter than what the images differ by nearly everywhere, and "
         "their neighbours within one microlens. Tracers whose light falls on these pixels cannot be measured by "

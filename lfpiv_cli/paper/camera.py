@@ -268,10 +268,10 @@ def _mid_plane(work: Work, whites: Path, error_mm: float) -> dict[str, float]:
     quiet = Console(only_warnings=True)
     simulate_board(config, folder, overwrite=True, console=quiet)
     pictures = CalibrateOptions(white=[whites / "white.tif"], dark=whites / "dark.tif", board=[folder / "board.tif"])
-    told = calibrate_snapshot(config, folder / "calibration.h5", pictures, overwrite=True, console=quiet)
+    reported = calibrate_snapshot(config, folder / "calibration.h5", pictures, overwrite=True, console=quiet)
     # after the move of Eq. 21 the focal plane is as far off the mid plane as it was off the board, times n_w
     return {
-        "mid_mm": told["mid_plane_z_mm"],
-        "sigma_mm": told["mid_plane_z_mm_sigma"],
+        "mid_mm": reported["mid_plane_z_mm"],
+        "sigma_mm": reported["mid_plane_z_mm_sigma"],
         "true_mm": error_mm * sections()["media"]["fluid"],
     }

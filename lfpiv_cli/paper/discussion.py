@@ -29,22 +29,24 @@ from lfpiv_cli.weights.build import default_padding, factorise
 
 
 @styled
-def depth_resolution_figure(told: Mapping[str, Any], geometric_mm: float, lens_mm: float) -> Figure:
+def depth_resolution_figure(reported: Mapping[str, Any], geometric_mm: float, lens_mm: float) -> Figure:
     """What depth can be told to, over depth: the length of a tracer reconstructed by SART, the depth in which the
     outermost views move by one microlens, and the Cramer-Rao bound of a tracer's place.
 
     Parameters
     ----------
-    told : `elongation_mm` (m,) at `elongation_depth_mm`, and the bound `sigma_mm` (n, 3) of x, y, z at `depth_mm`
+    reported : `elongation_mm` (m,) at `elongation_depth_mm`, and the bound `sigma_mm` (n, 3) of x, y, z at `depth_mm`
     geometric_mm, lens_mm : depth in which views move by one microlens, and its width in the scene
     """
     figure, axes = new_panels(7.5, 4.6)
-    sigma = np.array(told["sigma_mm"])
-    axes.semilogy(told["elongation_depth_mm"], told["elongation_mm"], "s-", color=VERMILION, label="length by SART")
+    sigma = np.array(reported["sigma_mm"])
+    axes.semilogy(
+        reported["elongation_depth_mm"], reported["elongation_mm"], "s-", color=VERMILION, label="length by SART"
+    )
     axes.axhline(geometric_mm, color=ORANGE, linestyle="--", label="depth that moves views by a microlens")
     axes.axhline(lens_mm, color="0.4", linestyle=":", label="microlens in the scene")
-    axes.semilogy(told["depth_mm"], sigma[:, 2], "-", color=BLUE, label="smallest error in depth")
-    axes.semilogy(told["depth_mm"], sigma[:, 0], "-.", color=GREEN, label="smallest error across")
+    axes.semilogy(reported["depth_mm"], sigma[:, 2], "-", color=BLUE, label="smallest error in depth")
+    axes.semilogy(reported["depth_mm"], sigma[:, 0], "-.", color=GREEN, label="smallest error across")
     axes.set(xlabel="depth behind the focal plane (mm)", ylabel="mm")
     axes.grid(alpha=0.3, which="both")
     axes.legend(fontsize=8, ncols=2, loc="upper center", bbox_to_anchor=(0.5, -0.14))
@@ -52,19 +54,19 @@ def depth_resolution_figure(told: Mapping[str, Any], geometric_mm: float, lens_m
 
 
 @styled
-def seeding_bound_figure(told: Mapping[str, Any], papers_per_lens: float) -> Figure:
+def seeding_bound_figure(reported: Mapping[str, Any], papers_per_lens: float) -> Figure:
     """The Cramer-Rao bound of a tracer among others that are to be found as well, median, over how many there are; the
     line is the paper's seeding.
 
     `sigma_mm` is (n, 3), `per_lens` (n,).
     """
     figure, axes = new_panels(6.5, 3.8)
-    sigma = 1e3 * np.array(told["sigma_mm"])
-    axes.loglog(told["per_lens"], sigma[:, 2], "o-", color=BLUE, label="depth")
-    axes.loglog(told["per_lens"], sigma[:, 0], "^-.", color=GREEN, label="across")
+    sigma = 1e3 * np.array(reported["sigma_mm"])
+    axes.loglog(reported["per_lens"], sigma[:, 2], "o-", color=BLUE, label="depth")
+    axes.loglog(reported["per_lens"], sigma[:, 0], "^-.", color=GREEN, label="across")
     axes.axvline(papers_per_lens, color="0.4", linestyle="--", label="the paper's seeding")
     axes.set(xlabel="tracers per microlens", ylabel="smallest standard error (µm)")
-    axes.set_xticks(told["per_lens"], labels=[f"{each:g}" for each in told["per_lens"]])
+    axes.set_xticks(reported["per_lens"], labels=[f"{each:g}" for each in reported["per_lens"]])
     axes.minorticks_off()
     axes.grid(alpha=0.3, which="both")
     axes.legend()
@@ -152,21 +154,21 @@ def discussion(work: Work) -> Findings:
     config = work.config("camera", sections(camera={"sensor": {"columns": SIDE_PX, "rows": SIDE_PX}}))
     settings = load_config(config)
     camera, media = settings.camera_model(), settings.media_model()
-    told = work.step("depth", partial(_by_depth, work, camera, media))
+    reported = work.step("depth", partial(_by_depth, work, camera, media))
     crowd = work.step("seeding", partial(_by_seeding, work, camera, media))
     geometric = geometric_depth_mm(camera, media)
     per_pixel = (camera.pixel_mm / float(camera.lattice.pitch[0])) ** 2
-    sigma = np.array(told["sigma_mm"])
+    sigma = np.array(reported["sigma_mm"])
     return Findings(
         drawings=(
-            Drawing.of("depth", depth_resolution_figure, told, geometric, float(camera.scale(media).lens_mm)),
+            Drawing.of("depth", depth_resolution_figure, reported, geometric, float(camera.scale(media).lens_mm)),
             Drawing.of("seeding", seeding_bound_figure, crowd, PAPERS_PPP / per_pixel),
         ),
-        tables=(_table(told),),
+        tables=(_table(reported),),
         text=(
             f"The outermost views of the paper's camera move against each other by one microlens in {geometric:.2f} mm "
-            f"of depth: that is why a tracer reconstructed by SART ({told['iterations']} iterations) is "
-            f"{np.nanmin(told['elongation_mm']):.1f} to {np.nanmax(told['elongation_mm']):.1f} mm long (the "
+            f"of depth: that is why a tracer reconstructed by SART ({reported['iterations']} iterations) is "
+            f"{np.nanmin(reported['elongation_mm']):.1f} to {np.nanmax(reported['elongation_mm']):.1f} mm long (the "
             "paper's dots, four times as wide: 3.1 to 3.9 mm). Length is not error: the light of one tracer "
             f"({LIGHT_COUNTS:g} counts) tells its depth to "
             f"{1e3 * sigma[:, 2].min():.0f} µm at best and its place across to {1e3 * sigma[:, 0].min():.1f} µm, "
@@ -201,12 +203,12 @@ def _by_seeding(work: Work, camera: Camera, media: Media) -> dict[str, Any]:
     return {"per_lens": list(seedings), "sigma_mm": sigma}
 
 
-def _table(told: Mapping[str, Any]) -> Table:
+def _table(reported: Mapping[str, Any]) -> Table:
     """Return elongation and bound at the depths that have both."""
-    sigma = np.array(told["sigma_mm"])
+    sigma = np.array(reported["sigma_mm"])
     rows = []
-    for depth, length in zip(told["elongation_depth_mm"], told["elongation_mm"], strict=True):
-        x, _, z = (float(np.interp(depth, told["depth_mm"], each)) for each in sigma.T)
+    for depth, length in zip(reported["elongation_depth_mm"], reported["elongation_mm"], strict=True):
+        x, _, z = (float(np.interp(depth, reported["depth_mm"], each)) for each in sigma.T)
         rows.append((f"{depth:+.0f}", f"{length:.2f}", f"{1e3 * x:.2f}", f"{1e3 * z:.1f}"))
     return Table(
         "By depth behind the focal plane",

@@ -61,8 +61,8 @@ def faults_figure(over: Mapping[str, Mapping[str, float]], words: Mapping[str, s
         missed = not value <= 1.0
         colour = "black" if shade[row, column] > 1.0 else "white"
         weight = "bold" if missed else "normal"
-        told = f"{value:.0e}".replace("e+0", "e") if value >= 1000.0 else f"{value:.{0 if value >= 9.95 else 1}f}"
-        axes.text(column, row, told, ha="center", va="center", fontsize=8, color=colour, fontweight=weight)
+        reported = f"{value:.0e}".replace("e+0", "e") if value >= 1000.0 else f"{value:.{0 if value >= 9.95 else 1}f}"
+        axes.text(column, row, reported, ha="center", va="center", fontsize=8, color=colour, fontweight=weight)
     axes.set_xticks(range(len(names)), [words[name] for name in names], rotation=40, ha="right", fontsize=8)
     axes.set_yticks(range(len(table)), list(over), fontsize=8)
     bar = figure.colorbar(image, ax=axes, ticks=range(int(DECADES[0]), int(DECADES[1]) + 1))

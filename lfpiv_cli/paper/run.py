@@ -95,11 +95,11 @@ def page_of(
         seeds = f"Seeds {', '.join(map(str, part['seeds']))}. " if part["seeds"] else ""
         seconds = part["seconds"]
         took = f"{seconds:.0f} s" if seconds < 100.0 else f"{seconds / 60.0:.0f} min"
-        told = (*part["text"], f"{seeds}This part took {took}.")
+        reported = (*part["text"], f"{seeds}This part took {took}.")
         pictures = [pages.Picture(folder / each["path"], each["caption"]) for each in part["pictures"]]
         again = f"lfpiv validate paper {'--quick ' if size == 'quick' else ''}-o . --resume --only {name}"
         commands = (*part["commands"], again)
-        sections.append(pages.Section(PARTS[name].title, name, told, tuple(tables), tuple(pictures), commands))
+        sections.append(pages.Section(PARTS[name].title, name, reported, tuple(tables), tuple(pictures), commands))
     libraries = ", ".join(f"{name} {version}" for name, version in made["libraries"].items())
     foot = f"Made by lfpiv {made['version']} ({libraries})."
     if notes:
@@ -173,9 +173,9 @@ def validate_paper(
     short = []
     for row in rows:
         value = getattr(row, row.judged)
-        told = "unknown" if value is None else written(value)
+        reported = "unknown" if value is None else written(value)
         if row.verdict != "met":
-            short.append(f"{row.quantity} ({row.source}) is {told}, expected {row.sense} {row.limit:g}")
+            short.append(f"{row.quantity} ({row.source}) is {reported}, expected {row.sense} {row.limit:g}")
     if short:
         raise LimitMissedError(f"{paths['index.html']}: {'; '.join(short)}", summary)
     return summary

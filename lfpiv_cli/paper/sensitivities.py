@@ -78,7 +78,7 @@ class Measured:
         """Return the largest of these errors that is known, 0 where none is."""
         return max(np.nan_to_num([self.error_mm(each) for each in self.influence.sensitivities]))
 
-    def told(self, of: Sensitivity) -> str:
+    def reported(self, of: Sensitivity) -> str:
         """Return a sensitivity with its unit."""
         place = f", {of.reach[1]}" if of.at is not None and of.reach[1] != "everywhere" else ""
         return f"{of.text}{place}: {written(of.factor * self.value(of))} {of.unit}"
@@ -185,8 +185,8 @@ def drawing_of(found: Measured) -> Drawing:
             axes.set_xticks(found.values, [f"{value:g}" for value in found.values])
             axes.minorticks_off()
         axes.grid(alpha=0.3)
-        told = [found.told(each) for each in influence.sensitivities if each.figure in panel.series]
-        axes.set_title("\n".join(textwrap.fill(each, NOTE_WIDTH) for each in told), fontsize=8, loc="left")
+        reported = [found.reported(each) for each in influence.sensitivities if each.figure in panel.series]
+        axes.set_title("\n".join(textwrap.fill(each, NOTE_WIDTH) for each in reported), fontsize=8, loc="left")
         if len(panel.series) > ROOM:
             axes.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.17), ncols=2)
         else:
@@ -227,7 +227,7 @@ def crowding(found: Measured) -> str:
     """Return the paper's seeding in tracers for each microlens, and where errors begin to rise."""
     values, recall = found.values, found.median("recall")
     beyond = values[recall < SEEN_SHARE]
-    told = f"from {beyond[0]:g} on" if beyond.size else "at none"
+    reported = f"from {beyond[0]:g} on" if beyond.size else "at none"
     rms = {name: found.at(f"{name}_rms_w", PAPER_PER_LENS) for name in ("tracks", "volumes")}
     better = values[found.median("tracks_rms_w") > found.median("volumes_rms_w")]
     turned = f", and from {better[0]:g} on volumes do better" if better.size else ""
@@ -237,7 +237,8 @@ def crowding(found: Measured) -> str:
         f"each microlens, over the 10 mm of its channel. There {found.at('recall', PAPER_PER_LENS):.0%} of the tracers "
         f"are found, and a displacement in depth is wrong by {written(rms['tracks'], 2)} mm rms by particles and by "
         f"{written(rms['volumes'], 2)} mm by volumes. Of the seedings tried, fewer than {SEEN_SHARE:.0%} are found "
-        f"{told}: neighbours are taken for one another, and the error of a particle's displacement in depth rises from "
-        f"{written(few, 2)} mm at {values[0]:g} for each microlens to {written(many, 2)} mm at {values[-1]:g}{turned}. "
-        "That of volumes is not one of neighbours: light is smeared over millimetres of depth at any seeding."
+        f"{reported}: neighbours are taken for one another, and the error of a particle's displacement in depth rises "
+        f"from {written(few, 2)} mm at {values[0]:g} for each microlens to {written(many, 2)} mm at "
+        f"{values[-1]:g}{turned}. That of volumes is not one of neighbours: light is smeared over millimetres of depth "
+        "at any seeding."
     )

@@ -196,7 +196,9 @@ def table3(work: Work, half: Half) -> Findings:
     depth_errors = Table("Depth error (%) by what is taken for the depth of a dot", head, tuple(definitions))
     middle = boards.depths_mm.index(0.0)
     kept = {METHODS[method]: steps[method][middle]["view"] for method in VIEWED}
-    views = {told: {name: np.array(each, np.float64) for name, each in view.items()} for told, view in kept.items()}
+    views = {
+        reported: {name: np.array(each, np.float64) for name, each in view.items()} for reported, view in kept.items()
+    }
     return Findings(
         rows=tuple(_row(boards, measure, figures) for measure in of_boards.MEASURES),
         drawings=_drawings(boards, figures, views, dots),
@@ -271,10 +273,10 @@ def _where_steps(depth_mm: Floats, errors: Floats) -> str:
     """Return in words which steps the depth error comes from."""
     near = np.abs(0.5 * (depth_mm[1:] + depth_mm[:-1])) < NEAR_MM
     share = np.abs(errors[near]).sum() / np.abs(errors).sum()
-    told = f"{100.0 * share:.0f} % of it comes from the {near.sum()} steps within {NEAR_MM:g} mm of the focal plane"
+    reported = f"{100.0 * share:.0f} % of it comes from the {near.sum()} steps within {NEAR_MM:g} mm of the focal plane"
     if near.all():
-        return told
-    return f"{told}; the others err by {100.0 * np.abs(errors[~near]).mean():.2f} %"
+        return reported
+    return f"{reported}; the others err by {100.0 * np.abs(errors[~near]).mean():.2f} %"
 
 
 def _text(work: Work, boards: _Boards, figures: Figures) -> tuple[str, ...]:

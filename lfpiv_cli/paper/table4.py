@@ -67,7 +67,7 @@ class ChannelSize:
         """Tracers in the volume: as dense as 8300 in the paper's, 0.002 per pixel of its sensor."""
         return round(8300 * self.length_mm * self.width_mm**2 / 1300.0)
 
-    def told(self) -> str:
+    def reported(self) -> str:
         """Return the size in words."""
         shape = " x ".join(f"{round(side / VOXEL_MM)}" for side in self.volume_mm)
         return (
@@ -161,7 +161,9 @@ def table4(work: Work) -> Findings:
         name: work.step(f"{name}_figures", partial(_measured, config, images, work.folder / name, work.console))
         for name, config in configs.items()
     }
-    methods = {told: _read(configs[name], work.folder / name) for name, told in SHOWN.items() if name in configs}
+    methods = {
+        reported: _read(configs[name], work.folder / name) for name, reported in SHOWN.items() if name in configs
+    }
     duct = simulated_duct(configs["ert"])
     return Findings(
         rows=_rows(found),
@@ -263,11 +265,11 @@ def _reason(name: str, found: Mapping[str, Mapping[str, Any]], paper: Mapping[st
     worse = [way for way, error in ours.items() if error is not None and error > paper[f"paper_{way}_percent"]]
     if not worse or name == "overall":
         return ""
-    axis, told = "z" if name.startswith("z") else "y", []
+    axis, reported = "z" if name.startswith("z") else "y", []
     for way in worse:
         errors = np.array(found[way]["slices"][axis]["streamwise_mean_error"], dtype=np.float64)
-        told.append(f"{way.upper()}'s have an rms of {float(100.0 * np.sqrt(np.nanmean(errors**2))):.2f} %")
-    scatter = f"the mean errors of single planes of windows across {axis} scatter: {', '.join(told)}"
+        reported.append(f"{way.upper()}'s have an rms of {float(100.0 * np.sqrt(np.nanmean(errors**2))):.2f} %")
+    scatter = f"the mean errors of single planes of windows across {axis} scatter: {', '.join(reported)}"
     return f"{scatter}; a slice of less than that is one by chance"
 
 
@@ -337,7 +339,7 @@ def _text(work: Work, size: ChannelSize, found: Mapping[str, Mapping[str, Any]])
         "A tiny experiment", "A reduced experiment, without DLFC", "The paper's experiment, full size"
     )
     return (
-        f"{reduced}: {size.told()}. A pair of raw images of tracers in the laminar flow of a square duct is "
+        f"{reduced}: {size.reported()}. A pair of raw images of tracers in the laminar flow of a square duct is "
         "rendered by Snell's law through wall and water, with a turned, shifted array, distortion, light's own noise "
         "and the sensor's. All ways get the same two images. ERT is calibrated by one snapshot of a board on the wall, "
         "DLFC by five boards in the water; both reconstruct by SART, "

@@ -82,7 +82,7 @@ class Together:
         return float(_of_root(self.diffusion_px, np.sqrt(self.covariance[1, 1])))
 
     @property
-    def told(self) -> bool:
+    def reported(self) -> bool:
         """Whether the images tell diffusion, not what is usual."""
         return bool(self.sigma_px < TOLD * USUAL_SIGMA_PX)
 

@@ -28,9 +28,9 @@ from lfpiv_cli.particles.least_squares import (
     copy_rows,
     fit,
     lit_by,
+    prior_chi2,
     respond_all,
     room_for,
-    surprise,
 )
 from lfpiv_cli.particles.refraction import on_line_of_sight
 from lfpiv_cli.particles.view import View, entry_capacity, over_tiles
@@ -239,7 +239,7 @@ def _fit_again(
         respond_all(view, best, responses)
         pixels, values = lit_by(responses, 0)
         add_light(pixels, values, best[0, 3], residual)
-        before = change_by(pixels, values, best[0, 3], residual, observation.weight) + surprise(best, expected)
+        before = change_by(pixels, values, best[0, 3], residual, observation.weight) + prior_chi2(best, expected)
         after = fit(observation, best, expected, responses, effort)
         if depths.shape[1] > 0:
             lowest = after - elsewhere[1]

@@ -343,11 +343,11 @@ def _equations(
             expected, weight, row = prior[m, i], prior[m, UNKNOWNS + i], m * UNKNOWNS + i
             right[row] += weight * (expected - members[m, i])
             matrix[row, row] += weight
-    return change + surprise(members, prior)
+    return change + prior_chi2(members, prior)
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
-def surprise(members: Floats, prior: Floats) -> float:
+def prior_chi2(members: Floats, prior: Floats) -> float:
     """Return what particles (k, 4) add to chi-squared by being other than expected (k, 8)."""
     total = 0.0
     for m in range(members.shape[0]):

@@ -110,7 +110,7 @@ def find_predicted(task: Task, predicted: Predicted, progress: Callable[[int], N
     low, high = task.depths_mm
     depth = predicted.particles[:, 2]
     expected = predicted.part((depth >= low) & (depth <= high))
-    state = gone_on(task, expected)
+    state = continued(task, expected)
     if not len(expected.particles) or len(state.particles) < LEAST_FOUND * len(expected.particles):
         return None
     state = settled(task, state, state.particles)
@@ -124,7 +124,7 @@ def find_predicted(task: Task, predicted: Predicted, progress: Callable[[int], N
     return finished(task, state, SEARCHES[-1])
 
 
-def gone_on(task: Task, predicted: Predicted) -> State:
+def continued(task: Task, predicted: Predicted) -> State:
     """Return the state with those particles that go on as predicted, all refined together."""
     at, scale = predicted.particles, task.view.scale
     typical = float(np.median(at[:, 3])) if len(at) else 0.0

@@ -23,25 +23,25 @@ COLOURS = (style.GREEN, style.VERMILION, style.BLUE)
 
 
 @style.styled
-def planning_figure(told: Mapping[str, Floats], bounds_mm: Floats) -> style.Figure:
+def planning_figure(reported: Mapping[str, Floats], bounds_mm: Floats) -> style.Figure:
     """Return errors over depth, and the volume within the field of view seen from above and from the side.
 
     Parameters
     ----------
-    told : `depth_mm` (n,), `sigma_mm` (n, 3), half the fields of view `full_view_mm` and `any_view_mm` (n, 2)
+    reported : `depth_mm` (n,), `sigma_mm` (n, 3), half the fields of view `full_view_mm` and `any_view_mm` (n, 2)
     bounds_mm : (3, 2) of the volume, z from the focal point
     """
     figure, (errors, *views) = style.new_panels(9.5, 3.6, 1, 3)
-    depth = told["depth_mm"]
+    depth = reported["depth_mm"]
     for axis, name in enumerate(style.AXIS_NAMES):
-        sigma_um = 1e3 * told["sigma_mm"][:, axis]
+        sigma_um = 1e3 * reported["sigma_mm"][:, axis]
         errors.semilogy(depth, sigma_um, color=COLOURS[axis], marker=style.MARKERS[axis], label=name)
     errors.set(xlabel="z from the focal plane (mm)", ylabel="smallest error of a tracer alone (µm)")
     errors.grid(alpha=0.3, which="both")
     errors.legend()
     for axis, axes in enumerate(views):
         for key, label, shade in (("any_view_mm", "seen in part", 0.85), ("full_view_mm", "seen in full", 0.65)):
-            half = told[key][:, axis]
+            half = reported[key][:, axis]
             axes.fill_between(depth, -half, half, color=str(shade), label=label)
         (left, right), (low, high) = bounds_mm[2], bounds_mm[axis]
         axes.plot([left, right, right, left, left], [low, low, high, high, low], color=style.VERMILION, label="volume")

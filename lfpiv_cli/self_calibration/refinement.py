@@ -198,8 +198,8 @@ def refine_calibration(
     count = int(np.ceil(flow.width_mm * (1.0 + 2.0 * MARGIN_PER_WIDTH) / deep))
     x, y = (0.5 * sum(flow.volume.bounds_mm(axis)) for axis in (0, 1))
     grid = Grid.centred((columns, rows, count), (dx, dy, deep), (x, y, calibration.mid_plane_z_mm or 0.0))
-    told = flow.light
-    waves = None if told is None else Light(told.wavelength_mm, told.diffusion_px, grid.bounds_mm(2))
+    reported = flow.light
+    waves = None if reported is None else Light(reported.wavelength_mm, reported.diffusion_px, grid.bounds_mm(2))
     view = raw_view(camera, media, 0.5 * (given or UNKNOWN_LENSES * scale.lens_mm), calibration, light=waves)
     weights = Weights.factorised(camera, media, grid, calibration)
     sums = normalisers(weights.padded)

@@ -99,7 +99,7 @@ def high_derivatives_in(found: Trajectories, frames: Sequence[Seen]) -> HighDeri
     middles = range(width // 2, len(frames) - (width - 1) // 2, width)
     windows = [_window(frame, len(frames)) for frame in middles]
     share = MOST_TRACKS // len(windows)
-    told: list[tuple[Floats, Floats, Floats]] = []
+    reported: list[tuple[Floats, Floats, Floats]] = []
     for window in windows:
         numbers = found.labels[window[0]]
         numbers = np.unique(numbers[numbers != NO_TRACK])
@@ -108,10 +108,10 @@ def high_derivatives_in(found: Trajectories, frames: Sequence[Seen]) -> HighDeri
         position, covariance = places_with_covariances(
             found, frames, window, numbers[:: max(1, len(numbers) // max(share, 1))]
         )
-        told.append((position, covariance, np.array(window, dtype=np.float64) - window[len(window) // 2]))
-    position, covariance = (np.concatenate([each[k] for each in told]) for k in range(2))
+        reported.append((position, covariance, np.array(window, dtype=np.float64) - window[len(window) // 2]))
+    position, covariance = (np.concatenate([each[k] for each in reported]) for k in range(2))
     known = np.isfinite(position).all(axis=(1, 2))
-    return high_derivatives_of(position[known], covariance[known], told[0][2])
+    return high_derivatives_of(position[known], covariance[known], reported[0][2])
 
 
 def places_with_covariances(
@@ -232,13 +232,13 @@ class Scatter:
     ----------
     noise : (3,) how large errors of places are over the stated ones
     bending : (3,) variance of the second derivatives, mm^2 per frame^4
-    twisting : (3,) variance of the third derivatives, mm^2 per frame^6
+    jerk : (3,) variance of the third derivatives, mm^2 per frame^6
     noise_known, bending_known : whether tracks are enough to tell them, or else errors as stated and straight tracks
     """
 
     noise: Floats
     bending: Floats
-    twisting: Floats
+    jerk: Floats
     noise_known: bool = False
     bending_known: bool = False
 
@@ -256,7 +256,7 @@ def fit_in_time(position_mm: Floats, sigma_mm: Floats, time: Floats, scatter: Sc
     position_mm, sigma_mm : (n, m, 3) places and their stated standard errors
     time : (m,) of the frames
     """
-    expected = np.stack([scatter.bending, scatter.twisting])
+    expected = np.stack([scatter.bending, scatter.jerk])
     # Residuals smaller than stated show that errors of neighbouring frames are alike, not that they are smaller.
     noise = np.maximum(scatter.noise, 1.0)
     solution, covariance = _cubic(position_mm, sigma_mm * noise, time, expected)
@@ -271,7 +271,7 @@ def scatter_of(pieces: Iterable[tuple[Floats, Floats]], time: Floats) -> Scatter
     Third derivatives are told by tracks of five places or more; where these are too few they are taken for those of
     circles with the velocities and the bendings that there are.
     """
-    told: list[list[Floats]] = [[], [], [], []]
+    reported: list[list[Floats]] = [[], [], [], []]
     about = time - np.mean(time)
     for places, errors in pieces:
         count = np.isfinite(places[..., 0]).sum(axis=1)
@@ -287,11 +287,11 @@ def scatter_of(pieces: Iterable[tuple[Floats, Floats]], time: Floats) -> Scatter
             over = squares / (2.0 * gammaincinv(0.5 * freedom[freedom > 0], 0.5))[:, np.newaxis]
             parts = [np.stack([solution[..., k], covariance[..., k, k]], axis=1) for k in (2, 3)]
             third = parts[1][:0] if terms == PARABOLA else parts[1]
-            for kept, new in zip(told, (over, solution[..., 1].copy(), parts[0], third), strict=True):
+            for kept, new in zip(reported, (over, solution[..., 1].copy(), parts[0], third), strict=True):
                 kept.append(new)
-    misfit, velocity, second, third = (np.concatenate(each) for each in told)
+    misfit, velocity, second, third = (np.concatenate(each) for each in reported)
     # Pieces go as soon as they are put together.
-    del told
+    del reported
     if len(second) < FEWEST_TRACKS:
         return Scatter.unknown()
     noise2: Floats = np.ones(3)
@@ -300,12 +300,12 @@ def scatter_of(pieces: Iterable[tuple[Floats, Floats]], time: Floats) -> Scatter
         noise2 = np.median(misfit, axis=0)
     bending = _variance(second, noise2)
     if len(third) >= FEWEST_TRACKS:
-        twisting = _variance(third, noise2, SHOWN)
+        jerk = _variance(third, noise2, SHOWN)
     else:
         # On a circle a velocity u and a second derivative a go with a third one of a^2 / u.
         around = np.sum((MAD_TO_SIGMA * np.median(np.abs(velocity - np.median(velocity, axis=0)), axis=0)) ** 2)
-        twisting = bending * np.sum(bending) / around if around else np.zeros(3)
-    return Scatter(np.sqrt(noise2), bending, twisting, noise_known=noise_known, bending_known=True)
+        jerk = bending * np.sum(bending) / around if around else np.zeros(3)
+    return Scatter(np.sqrt(noise2), bending, jerk, noise_known=noise_known, bending_known=True)
 
 
 def _variance(derivatives: Floats, noise2: Floats, shown: float = 0.0) -> Floats:

@@ -35,7 +35,7 @@ SHORTEST = 3
 
 
 @dataclass(frozen=True, eq=False)
-class Ahead:
+class Prediction:
     """Where particles should be in a frame.
 
     Attributes
@@ -52,7 +52,7 @@ class Ahead:
 
 
 @dataclass(frozen=True, eq=False)
-class SoFar:
+class PartialTracks:
     """How far a sequence has been followed.
 
     Attributes
@@ -67,7 +67,7 @@ class SoFar:
     scatter: Scatter
     by_past: Forecast | None
     by_others: Forecast | None
-    ahead: Ahead
+    ahead: Prediction
 
     @property
     def last(self) -> int:
@@ -83,42 +83,44 @@ def follow(frames: Sequence[Seen], search_mm: float, shortest: int, scale: Scale
     search_mm : largest displacement along each axis from the first frame to the second
     scale : of the camera
     """
-    so_far = begun(frames)
-    while so_far.last < len(frames) - 1:
-        so_far = followed_further(so_far, frames, search_mm, scale)
-    return long_ones(so_far.found, shortest)
+    partial = begun(frames)
+    while partial.last < len(frames) - 1:
+        partial = extended(partial, frames, search_mm, scale)
+    return long_ones(partial.found, shortest)
 
 
-def begun(frames: Frames) -> SoFar:
+def begun(frames: Frames) -> PartialTracks:
     """Return what is known of the first frame alone: particles, and no tracks."""
     first = frames[0]
     unlinked = Trajectories((np.full(len(first), NO_TRACK),), 0, (np.full(len(first), np.nan),))
     unknown = np.full(first.position_mm.shape, np.nan)
-    nothing = Ahead(first.position_mm, unknown, first.light_value(), 0.0)
-    return SoFar(unlinked, Scatter.unknown(), None, None, nothing)
+    nothing = Prediction(first.position_mm, unknown, first.light_value(), 0.0)
+    return PartialTracks(unlinked, Scatter.unknown(), None, None, nothing)
 
 
-def followed_further(so_far: SoFar, frames: Frames, search_mm: float, scale: Scale) -> SoFar:
+def extended(partial: PartialTracks, frames: Frames, search_mm: float, scale: Scale) -> PartialTracks:
     """Return how far it is with one more frame; of `frames` only the new one and the last few before are looked at."""
-    number, count = so_far.last, len(frames[so_far.last + 1])
+    number, count = partial.last, len(frames[partial.last + 1])
     found = Trajectories(
-        (*so_far.found.labels, np.full(count, NO_TRACK)),
-        so_far.found.count,
-        (*so_far.found.probability, np.full(count, np.nan)),
+        (*partial.found.labels, np.full(count, NO_TRACK)),
+        partial.found.count,
+        (*partial.found.probability, np.full(count, np.nan)),
     )
     start, end = frames[number], frames[number + 1]
-    ahead, own = so_far.ahead, slice(0, len(start))
+    ahead, own = partial.ahead, slice(0, len(start))
     known = np.isfinite(ahead.sigma_mm[own])
     moved = ahead.position_mm[own] - start.position_mm + np.where(known, 0.0, np.nan)
     links = track(start, end, search_mm, scale, Forecast(moved, ahead.sigma_mm[own]) if known.any() else None)
     found = _linked(found, number, number + 1, links)
     if number:
-        earlier = _forecast(found, frames, number - 1, 2, so_far.scatter)
+        earlier = _forecast(found, frames, number - 1, 2, partial.scatter)
         found = _linked(found, number - 1, number + 1, _bridges(found, frames, number, earlier, search_mm, scale))
     window = _frames_before(number + 2, PAST_FRAMES)
     position, sigma = places(found, frames, window, tracks_in(found, window))
     scatter = scatter_of([(position, sigma)], np.arange(len(window), dtype=np.float64))
-    past_factor, others_factor = (_surprise(start, end, links, each) for each in (so_far.by_past, so_far.by_others))
+    past_factor, others_factor = (
+        _residual_factor(start, end, links, each) for each in (partial.by_past, partial.by_others)
+    )
     by_past, by_others = _forecast(found, frames, number + 1, 1, scatter), _by_others(found, frames)
     # By both; where others are not known, the past is all there is.
     forecast = past = _widened(by_past, past_factor)
@@ -131,10 +133,10 @@ def followed_further(so_far: SoFar, frames: Frames, search_mm: float, scale: Sca
             off = np.nan_to_num(past.displacement_mm - by_others.displacement_mm)
             forecast = Forecast(by_others.displacement_mm + weight * off, np.sqrt((1.0 - weight) * variance))
     over_two = _widened(_forecast(found, frames, number, 2, scatter), past_factor)
-    return SoFar(found, scatter, by_past, by_others, _ahead(found, frames, forecast, over_two))
+    return PartialTracks(found, scatter, by_past, by_others, _ahead(found, frames, forecast, over_two))
 
 
-def _surprise(first: Seen, second: Seen, links: Tracks, forecast: Forecast | None) -> Floats | None:
+def _residual_factor(first: Seen, second: Seen, links: Tracks, forecast: Forecast | None) -> Floats | None:
     """Return how large errors (3,) of a forecast are over what is expected of them, at least 1; None: not known.
 
     Few frames know little of how tracks bend, and a parabola nothing of how their bending changes.
@@ -157,7 +159,7 @@ def _widened(forecast: Forecast | None, factor: Floats | None) -> Forecast | Non
     return Forecast(forecast.displacement_mm, forecast.sigma_mm * factor)
 
 
-def _ahead(found: Trajectories, frames: Frames, forecast: Forecast | None, over_two: Forecast | None) -> Ahead:
+def _ahead(found: Trajectories, frames: Frames, forecast: Forecast | None, over_two: Forecast | None) -> Prediction:
     """Return where the particles of the last frame should be in the next one, and those that it alone has lost.
 
     Parameters
@@ -185,7 +187,7 @@ def _ahead(found: Trajectories, frames: Frames, forecast: Forecast | None, over_
     if lit.any():
         ratio = np.log(now[lit] / earlier[lit])
         light_sigma = float(MAD_TO_SIGMA * np.median(np.abs(ratio - np.median(ratio))))
-    return Ahead(at, sigma, light, light_sigma)
+    return Prediction(at, sigma, light, light_sigma)
 
 
 def _by_others(found: Trajectories, frames: Frames) -> Forecast | None:
@@ -207,13 +209,13 @@ def _by_others(found: Trajectories, frames: Frames) -> Forecast | None:
 
 def scatter_in(found: Trajectories, frames: Sequence[Seen]) -> tuple[Scatter, int]:
     """Return noise and bending of the tracks of a sequence, and how many frames on either side of a time to take."""
-    told = []
+    reported = []
     for width in (2 * half + 1 for half in HALVES_FRAMES):
         # Windows of so many frames that do not overlap.
         windows = [_frames_before(end, width) for end in range(min(width, len(frames)), len(frames) + 1, width)]
         pieces = (places(found, frames, window, tracks_in(found, window)) for window in windows)
-        told.append(scatter_of(pieces, np.arange(len(windows[0]), dtype=np.float64)))
-    wide, narrow = told
+        reported.append(scatter_of(pieces, np.arange(len(windows[0]), dtype=np.float64)))
+    wide, narrow = reported
     is_followed = np.all(wide.noise <= LARGEST_MISFIT * narrow.noise)
     return (wide, HALVES_FRAMES[0]) if is_followed else (narrow, HALVES_FRAMES[1])
 
@@ -296,7 +298,7 @@ def _bridges(
 REACH_FRAMES = 3
 
 
-def expected_in(found: Trajectories, frames: Frames, number: int) -> Ahead:
+def expected_in(found: Trajectories, frames: Frames, number: int) -> Prediction:
     """Return where the particles should be whose tracks have a place in a frame or in one beside it.
 
     A track's own place in the frame counts as its others do. Of `frames` only those within `REACH_FRAMES` are read.
@@ -305,8 +307,8 @@ def expected_in(found: Trajectories, frames: Frames, number: int) -> Ahead:
     tracks = tracks_in(found, [k for k in window if abs(k - number) <= 1])
     position, sigma = places(found, frames, window, tracks)
     known = np.isfinite(position[..., 0])
-    told = known.sum(axis=1) > 1
-    tracks, position, sigma, known = tracks[told], position[told], sigma[told], known[told]
+    reported = known.sum(axis=1) > 1
+    tracks, position, sigma, known = tracks[reported], position[reported], sigma[reported], known[reported]
     time = np.array(window, dtype=np.float64) - number
     state = fit_in_time(position, sigma, time, scatter_of([(position, sigma)], time))
     light = np.full(known.shape, np.nan)
@@ -316,4 +318,4 @@ def expected_in(found: Trajectories, frames: Frames, number: int) -> Ahead:
     usual = np.nanmedian(light, axis=1) if len(tracks) else np.zeros(0)
     off = np.abs(light - usual[:, np.newaxis])[known]
     spread = MAD_TO_SIGMA * float(np.median(off)) if off.size else 0.0
-    return Ahead(state.position_mm, state.position_sigma, np.exp(usual), spread)
+    return Prediction(state.position_mm, state.position_sigma, np.exp(usual), spread)

@@ -153,8 +153,8 @@ def profiles_figure(methods: Mapping[str, Measured]) -> style.Figure:
         low, high = row[0].get_ylim()
         row[0].set_ylim(min(low, -least), max(high, least))
     shares = {name: cumulative_distribution(m.pairs) for name, m in methods.items()}
-    told = {"streamwise_share": "along the mean flow", "vector_share": "of the whole vector"}
-    for panel, (key, what) in zip(axes[3], told.items(), strict=False):
+    reported = {"streamwise_share": "along the mean flow", "vector_share": "of the whole vector"}
+    for panel, (key, what) in zip(axes[3], reported.items(), strict=False):
         for (name, found), colour in zip(shares.items(), cycle(style.COLOURS), strict=False):
             if found[key] is not None:
                 panel.plot(found["relative_error"], found[key], color=colour, label=name)
@@ -195,10 +195,10 @@ def slices_figure(methods: Mapping[str, Measured], duct: Duct) -> style.Figure:
             rows = {method: table[f"{name} {share}"] for method, table in tables.items()}
             ours = {method: errors["ours_percent"] for method, errors in rows.items()}
             errors = [f"{name} unknown" if e is None else f"{name} {e:.2f} %" for name, e in ours.items()]
-            told = textwrap.fill(f"mean error: {', '.join(errors)}", TITLE_WIDTH)
+            reported = textwrap.fill(f"mean error: {', '.join(errors)}", TITLE_WIDTH)
             paper = next(iter(rows.values()))["paper_ert_percent"]
             beside = f" (paper {paper:.2f} %)" if duct.is_the_papers else ""
-            panel.set_title(f"{name} = {share}{beside}\n{told}")
+            panel.set_title(f"{name} = {share}{beside}\n{reported}")
             panel.set(xlabel=f"{style.AXIS_NAMES[other]} (mm)", ylabel=f"{style.COMPONENT_NAMES[main]} (m/s)")
     axes[0, 0].legend()
     return figure

@@ -226,8 +226,8 @@ class Worked(Generic[Made]):
         """Return the summary of a batch of which nothing failed (PartialError: something did)."""
         if not self.failures:
             return summary
-        told = f"{len(self.failures)} of {self.total()} {unit}s failed, the first because {self.failures[0].error}"
-        raise PartialError(told, summary | {"failures": [asdict(failure) for failure in self.failures]})
+        reported = f"{len(self.failures)} of {self.total()} {unit}s failed, the first because {self.failures[0].error}"
+        raise PartialError(reported, summary | {"failures": [asdict(failure) for failure in self.failures]})
 
 
 def work_through(batch: Batch[Made], options: BatchOptions, console: Console) -> Worked[Made]:
@@ -334,9 +334,9 @@ def _settle(
             names = [batch.names[k] for k in worked.outcomes]
             if not names:
                 raise InputError(str(made)) from made
-            told = names[0] if len(names) == 1 else f"{names[0]} to {names[-1]}"
+            reported = names[0] if len(names) == 1 else f"{names[0]} to {names[-1]}"
             written = f"{len(names)} of {len(batch.targets)} {batch.unit}s were written before"
-            raise InputError(f"{made}; {written}: {told}") from made
+            raise InputError(f"{made}; {written}: {reported}") from made
         worked.failures.append(Failure(name, str(made)))
         work.console.warn([Notice("frame-failed", name, str(made), "leave it out, or mend it")])
     elif isinstance(made, Turn):
@@ -370,11 +370,11 @@ def dry_run(batch: Batch[Any], options: WorkOptions, console: Console) -> dict[s
     known = [sum(path.stat().st_size for path in batch.targets[number].paths) for number in skipped]
     counts = {"to_make": len(making), "skipped": len(skipped), "unreadable": len(faults) + len(batch.left_out)}
     expected = batch.expected() if making else Expected()
-    told: dict[str, Any] = {f"{batch.unit}s": len(share)}
-    told |= estimate(batch.label, counts, known, expected, batch.targets[0].path, console)
+    reported: dict[str, Any] = {f"{batch.unit}s": len(share)}
+    reported |= estimate(batch.label, counts, known, expected, batch.targets[0].path, console)
     if console.only_warnings:
-        told["would_make"] = [str(batch.targets[number].path) for number in making]
-    return told
+        reported["would_make"] = [str(batch.targets[number].path) for number in making]
+    return reported
 
 
 def estimate(

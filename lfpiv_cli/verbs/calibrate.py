@@ -120,11 +120,11 @@ def calibration_of(rig: Config, pictures: Photographs) -> Calibration:
     camera = rig.camera.model() if pictures.whites else rig.camera_model()
     if camera is not None:
         sheet.check_f_numbers(camera)
-    told = DataSheet(rig.camera.microlenses.layout, rig.micro_image_pitch_px(), camera)
+    reported = DataSheet(rig.camera.microlenses.layout, rig.micro_image_pitch_px(), camera)
     has_board = pictures.board is not None or len(pictures.depth_boards) > 0
     if has_board and rig.board.medium == "fluid":
         rig.ensure_plane_layers("calibrating by a board in the fluid")
-    return model.calibrate(pictures, rig.rig() if has_board else None, told)
+    return model.calibrate(pictures, rig.rig() if has_board else None, reported)
 
 
 def calibration_notices(rig: Config, pictures: Photographs, found: Calibration) -> list[Notice]:

@@ -101,15 +101,15 @@ def lattice_of(settings: Config, pictures: Pictures) -> tuple[Calibration | None
         found = calibration_of(settings, photographed)
     except (ConfigError, InputError) as error:
         return None, [Line("white image", "no", str(error))]
-    told = [each for each in calibration_notices(settings, photographed, found) if each not in (NO_BOARD,)]
-    told = [each for each in told if each.code != "f-numbers"]
+    reported = [each for each in calibration_notices(settings, photographed, found) if each not in (NO_BOARD,)]
+    reported = [each for each in reported if each.code != "f-numbers"]
     share = float(np.nanmax(pictures.white)) / full_scale(pictures.white, settings)
     reason = f"{found.fit.lenses} lens images {written(float(found.fit.lattice_px.pitch.mean()), 4)} px apart"
     verdict: Verdict = "good"
     if share > BRIGHTEST_WHITE:
         verdict, reason = "look", f"{reason}; it reaches {share:.0%} of full scale, two thirds are good"
-    if told:
-        verdict, reason = "look", "; ".join([reason, *(f"{each.text}: {each.remedy}" for each in told)])
+    if reported:
+        verdict, reason = "look", "; ".join([reason, *(f"{each.text}: {each.remedy}" for each in reported)])
     return found, [Line("white image", verdict, reason)]
 
 

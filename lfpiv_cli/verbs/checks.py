@@ -115,7 +115,7 @@ def figures_of(fields: Mapping[str, Sequence[Path]]) -> dict[str, dict[str, floa
 
     Files are read one after the other.
     """
-    told: dict[str, dict[str, float | int | None]] = {}
+    reported: dict[str, dict[str, float | int | None]] = {}
     for method, paths in fields.items():
         if not paths:
             continue
@@ -134,8 +134,8 @@ def figures_of(fields: Mapping[str, Sequence[Path]]) -> dict[str, dict[str, floa
             ranges = {"from": low[k], "to": high[k], "sigma": sigma[k]}
             figures |= {f"{name}_{what}_voxel": without_nan(value) for what, value in ranges.items()}
         for name, value in figures.items():
-            told.setdefault(name, {})[method] = value
-    return told
+            reported.setdefault(name, {})[method] = value
+    return reported
 
 
 def field_notices(quality: Quality, name: str) -> Iterator[Notice]:
@@ -412,6 +412,6 @@ def of_two_ways(one: VectorField, other: VectorField, names: tuple[str, str]) ->
     ratios = difference_over_stated(one, other)
     if ratios is None:
         return []
-    told = ", ".join(f"{ratio:.1f}" for ratio in ratios)
-    text = f"{names[0]} and {names[1]} differ by {told} (u, v, w) times what their stated errors let expect"
+    reported = ", ".join(f"{ratio:.1f}" for ratio in ratios)
+    text = f"{names[0]} and {names[1]} differ by {reported} (u, v, w) times what their stated errors let expect"
     return [Line("vectors", "look" if max(ratios) > LARGEST_OVER_STATED else "good", text)]

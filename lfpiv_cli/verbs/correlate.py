@@ -396,11 +396,11 @@ def summary_of(worked: Worked[Outcome], pairs: int) -> dict[str, Any]:
     """Return what is told of the fields of so many pairs."""
     outcomes = list(worked.outcomes.values())
     found = checks.quality_of_all([outcome.quality for outcome in outcomes])
-    told: dict[str, Any] = {
+    reported: dict[str, Any] = {
         "pairs": pairs,
         "skipped": worked.skipped,
         "vectors": found.vectors,
         "rejected": sum(outcome.rejected for outcome in outcomes),
     }
     divergence = [outcome.divergence_rms for outcome in outcomes if outcome.divergence_rms is not None]
-    return told | found.summary() | ({"divergence_rms_per_s": float(np.mean(divergence))} if divergence else {})
+    return reported | found.summary() | ({"divergence_rms_per_s": float(np.mean(divergence))} if divergence else {})

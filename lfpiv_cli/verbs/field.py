@@ -93,8 +93,8 @@ def pressure_of(
     low, high = motion.position_mm.min(axis=0), motion.position_mm.max(axis=0)
     flow, neglected = fit_field(moving, low, high), neglected_share(motion)
     accelerated = motion.position_mm, motion.acceleration, motion.covariance, sure
-    samples, told = _gradients(flow, *accelerated, settings, dt_s)
-    figures = {"frame": number, "tracks": len(tracks), **told, "neglected_share": neglected}
+    samples, reported = _gradients(flow, *accelerated, settings, dt_s)
+    figures = {"frame": number, "tracks": len(tracks), **reported, "neglected_share": neglected}
     return _on_windows(samples, settings, pressure.knots_for(samples.points_mm), neglected, figures)
 
 
@@ -184,14 +184,14 @@ def _on_windows(
     field = pressure.pressure_field(samples, lattice, np.random.default_rng(SEED), wrong_share)
     found = field.value_at(nodes.reshape(-1, 3)).reshape(grid.shape_zyx)
     sigma = np.sqrt(field.variance_at(nodes.reshape(-1, 3))).reshape(grid.shape_zyx)
-    told = {
+    reported = {
         "pressure_rms_pa": float(np.std(found)),
         "pressure_sigma_median_pa": float(np.median(sigma)),
         "pressure_knots_mm": list(lattice.cell_mm),
         "pressure_reduced_chi2": field.reduced_chi2,
         "pressure_belonging": float(np.sum(field.probability)),
     }
-    return PressureResult(grid, found, sigma, figures | told)
+    return PressureResult(grid, found, sigma, figures | reported)
 
 
 @dataclass(frozen=True, kw_only=True)

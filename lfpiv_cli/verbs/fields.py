@@ -110,13 +110,13 @@ class FittedField:
         about = vector_field.fluctuations(vectors.velocity, (0, 1, 2))
         sigma = vectors.uncertainty_voxel * np.asarray(vectors.voxel_mm) * (MM_TO_M / self.dt_s)
         stresses = vector_field.reynolds_stresses(about, sigma**2)
-        told = {
+        reported = {
             "reynolds_stresses_m2_s2": stresses.tolist(),
             "kinetic_energy_m2_s2": vector_field.kinetic_energy(stresses),
         }
         if known.all() and min(known.shape) >= vector_field.FEWEST_PLANES:
             found = vector_field.spectrum(about, self.windows.centres.spacing_mm)
-            told |= {
+            reported |= {
                 "spectrum_wavenumber_rad_m": found.wavenumber.tolist(),
                 "spectrum_energy_m3_s2": found.energy.tolist(),
             }
@@ -127,8 +127,8 @@ class FittedField:
             rate, error = vector_field.dissipation(
                 self.gradient(nodes), covariance, viscosity_m2_s, float(np.prod(self.field.lattice.cells))
             )
-            told |= {"dissipation_m2_s3": rate, "dissipation_m2_s3_sigma": error}
-        return told
+            reported |= {"dissipation_m2_s3": rate, "dissipation_m2_s3_sigma": error}
+        return reported
 
     def without(self) -> NDArray[np.bool_]:
         """Return at which windows' centres (nz, ny, nx) there is no vector: none near, or beyond walls."""
@@ -315,7 +315,7 @@ def fitted(parts: Sequence[Samples], settings: Config, divergence: Divergence, n
         "samples_belonging": float(np.sum(field.probability)),
         "divergence_rms_over_gradients_rms": rms / size if size else None,
     }
-    return FittedField(field, windows, samples.points_mm, dt_s, summary | field.told())
+    return FittedField(field, windows, samples.points_mm, dt_s, summary | field.reported())
 
 
 def fit_notices(summary: Mapping[str, Any], divergence: Divergence, name: str) -> list[Notice]:
@@ -418,8 +418,8 @@ def mean_of_measured(
     batch = Mean(mean, files, records[0].get("config") or {}, derived, overwrite)
     worked = work_through(batch, options, console)
     found = vtkhdf.open_vectors(mean)
-    told = {"files": len(files), "skipped": worked.skipped, "vectors": found.flag.size}
-    return told | {"rejected": int(np.count_nonzero(found.flag >= REJECTED))} | quality_of(found).summary()
+    reported = {"files": len(files), "skipped": worked.skipped, "vectors": found.flag.size}
+    return reported | {"rejected": int(np.count_nonzero(found.flag >= REJECTED))} | quality_of(found).summary()
 
 
 def _fields_in(path: Path) -> Iterator[VectorField]:

@@ -136,8 +136,8 @@ class Way(Batch[None]):
         work.console.warn(notices)
         if self.residuals:
             image_files.write_tiff(residual_path(target.path), left, overwrite=True)
-        told = replace(points, provenance=with_warnings(target.record, [*self.said, *notices]))
-        write_points(target.path, PARTICLES_FORMAT, told, overwrite=self._replace)
+        reported = replace(points, provenance=with_warnings(target.record, [*self.said, *notices]))
+        write_points(target.path, PARTICLES_FORMAT, reported, overwrite=self._replace)
 
     def read(self, number: int) -> Points:
         """Return the particles of a frame; none of one that was left out."""
@@ -282,15 +282,15 @@ def _write_tracks(
     first = way.read(there[0])
     carried = carried_config(first.provenance, way.targets[there[0]].path)
     inputs = {f"particles_{number:04d}": way.targets[number].path for number in there}
-    provenance = record("follow", carried.resolved() | tracking.told(), inputs)
+    provenance = record("follow", carried.resolved() | tracking.reported(), inputs)
     frames = SeenFrames(len(sequence.names), way.read)
     with stored_tracks(frames, first.reference, settings, tracking, provenance, output, found) as result:
         counts = [frames.particles(number) for number in there]
         notices = few_notices(counts, [sequence.names[number] for number in there], result.summary, result.points)
         console.warn(notices)
-        told = result.points.with_record(with_warnings(provenance, notices))
-        write_points(output / TRACKS, result.format_name, told, overwrite=overwrite)
-        write_playback(output / PLAYBACK, told, len(frames), tracking.dt_s, overwrite=overwrite)
+        reported = result.points.with_record(with_warnings(provenance, notices))
+        write_points(output / TRACKS, result.format_name, reported, overwrite=overwrite)
+        write_playback(output / PLAYBACK, reported, len(frames), tracking.dt_s, overwrite=overwrite)
     return {"particles_fewest": min(counts)} | {k: v for k, v in result.summary.items() if k != "frames"}
 
 

@@ -21,7 +21,15 @@ from lfpiv_cli.particles.rounds import first_pass
 from lfpiv_cli.particles.search import Particles, blank, rebuilt, result
 from lfpiv_cli.reconstruction.images import Image, light
 from lfpiv_cli.tracks.candidates import Seen, Trajectories, long_ones
-from lfpiv_cli.tracks.sequences import PAST_FRAMES, REACH_FRAMES, Ahead, SoFar, begun, expected_in, followed_further
+from lfpiv_cli.tracks.sequences import (
+    PAST_FRAMES,
+    REACH_FRAMES,
+    PartialTracks,
+    Prediction,
+    begun,
+    expected_in,
+    extended,
+)
 from lfpiv_cli.verbs.checks import few_notices
 from lfpiv_cli.verbs.frames import Bench, Progress, bench_of, check_frame, frame_notices, given_picture, picture_for
 from lfpiv_cli.verbs.particles import (
@@ -123,7 +131,7 @@ def follow(
         warn_of(frame_notices(bench, raw, light(raw, bench.dark, level), name))
     bench, size = sized(bench, (frame(number) for number in range(len(images))))
     warn_of(size_notices(chosen, size))
-    provenance = record("follow", chosen.resolved() | tracking.told(), {})
+    provenance = record("follow", chosen.resolved() | tracking.reported(), {})
     sequence = Recorded(bench, size, tracking, frame, names, provenance)
     particles: list[Points] = []
     way: Forwards | BothWays = (forwards := Forwards(sequence, particles.__getitem__))
@@ -191,7 +199,7 @@ class Forwards:
         """Take the sequence, and what gives the particles of a frame that were found before."""
         self._sequence, self._read = sequence, read
         self._recent: dict[int, Seen] = {}
-        self._so_far: SoFar | None = None
+        self._so_far: PartialTracks | None = None
         self._first_two: list[Particles] = []
 
     def find(self, number: int, progress: Progress | None = None) -> Found:
@@ -209,20 +217,20 @@ class Forwards:
         """Return how the particles of all frames belong together."""
         return self._up_to(len(self._sequence.names)).found
 
-    def _up_to(self, number: int) -> SoFar:
+    def _up_to(self, number: int) -> PartialTracks:
         """Link the particles of the frames before one."""
-        tracking, recent, so_far = self._sequence.tracking, self._recent, self._so_far
-        for k in range(0 if so_far is None else so_far.last + 1, number):
+        tracking, recent, partial = self._sequence.tracking, self._recent, self._so_far
+        for k in range(0 if partial is None else partial.last + 1, number):
             recent[k] = seen_in(self._read(k))
             recent.pop(k - LOOKED_BACK, None)
-            if so_far is None:
-                so_far = begun(recent)
+            if partial is None:
+                partial = begun(recent)
             else:
-                so_far = followed_further(so_far, recent, tracking.search_mm, tracking.scale)
-        if so_far is None:
+                partial = extended(partial, recent, tracking.search_mm, tracking.scale)
+        if partial is None:
             raise ValueError("a sequence has frames")
-        self._so_far = so_far
-        return so_far
+        self._so_far = partial
+        return partial
 
 
 class BothWays:
@@ -257,7 +265,7 @@ class BothWays:
 
 
 def _next(
-    sequence: Recorded, number: int, frame: Frame, ahead: Ahead, progress: Progress | None
+    sequence: Recorded, number: int, frame: Frame, ahead: Prediction, progress: Progress | None
 ) -> tuple[Particles, list[Notice]]:
     """Return the particles of a frame where they are ahead of those before it, and of the rest; what is said of it."""
     bench, task = sequence.bench, task_for(sequence.bench, frame)

@@ -184,7 +184,7 @@ def mask_of(
     return np.where(still, np.float32(0.0), np.float32(1.0))
 
 
-class Ahead:
+class ReadAhead:
     """Frames, each read while the one before is worked on."""
 
     def __init__(self, read: Read, numbers: Sequence[int]) -> None:

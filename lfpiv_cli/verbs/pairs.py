@@ -249,7 +249,7 @@ def coming_pairs(
     """
     seen: list[Path] = []
     made: set[tuple[int, int]] = set()
-    told: set[Notice] = set()
+    reported: set[Notice] = set()
     for files in coming:
         seen += files
         if len(seen) < 2:
@@ -263,8 +263,8 @@ def coming_pairs(
         last = max((second for _, second in made), default=0)
         before = {str(path) for path in seen[:last]}
         passed = [*found.notices, *(each for each in found.left_out if each.about in before)]
-        unsaid = [notice for notice in passed if notice not in told]
-        told.update(unsaid)
+        unsaid = [notice for notice in passed if notice not in reported]
+        reported.update(unsaid)
         console.warn(unsaid)
         if fresh:
             yield [seen[number] for numbers in fresh for number in numbers]

@@ -199,7 +199,9 @@ def _size_of(
         usual = USUAL_DIFFUSION_PX if shown is None else shown.diffusion_px
         diffusion = Diffusion(usual if given_px is None else given_px, given=given_px is not None)
         if shown is not None:
-            diffusion = replace(diffusion, measured_px=shown.diffusion_px, sigma_px=shown.sigma_px, told=shown.told)
+            diffusion = replace(
+                diffusion, measured_px=shown.diffusion_px, sigma_px=shown.sigma_px, reported=shown.reported
+            )
     if found is None:
         return TracerSize(given or UNKNOWN_LENSES * lens_mm, diffusion=diffusion)
     measured = lens_mm * found.lenses

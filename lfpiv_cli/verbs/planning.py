@@ -280,10 +280,10 @@ def _rays(bench: Bench) -> Line:
         notices = rig_notices(bench.settings, bench.found, bench.camera, source, bench.grid)
     except (ConfigError, InputError) as error:
         return Line("rays", "no", str(error))
-    told = [notice for notice in notices if notice.code != "f-numbers"]
-    if not told:
+    reported = [notice for notice in notices if notice.code != "f-numbers"]
+    if not reported:
         return Line("rays", "good", "paraxial lens and refraction are right to half a pixel")
-    return Line("rays", "look", "; ".join(f"{notice.about} {notice.text}: {notice.remedy}" for notice in told))
+    return Line("rays", "look", "; ".join(f"{notice.about} {notice.text}: {notice.remedy}" for notice in reported))
 
 
 def diffraction_line(bench: Bench) -> Line:
@@ -393,17 +393,17 @@ def _better_windows(bench: Bench) -> str:
     window = planning.proposed_window_mm(bench.camera, bench.media, sides, chosen.overlap)
     steps = window * (1.0 - np.asarray(chosen.overlap))
     vectors = np.maximum(np.floor(np.asarray(sides) / steps + ROUNDING), 1.0).astype(np.int64)
-    told = []
+    reported = []
     if chosen.window_mm is None or not np.allclose(chosen.window_mm, window, rtol=WINDOWS_ALIKE):
         instead = " in place of correlation.windows" if chosen.windows is not None else ""
-        told.append(f"set correlation.window_mm: {window.tolist()}{instead}, for {' x '.join(map(str, vectors))}")
+        reported.append(f"set correlation.window_mm: {window.tolist()}{instead}, for {' x '.join(map(str, vectors))}")
     few = [axis for axis, count in zip("xyz", vectors, strict=True) if count < planning.WORTH_VECTORS]
     if few:
         limit = f"smaller windows hold fewer than {planning.FEWEST_TRACERS:g}"
         if few == ["z"] and window[2] <= bench.scale.depth_mm:
             limit = f"they are about {written(bench.scale.depth_mm)} mm long in a volume"
-        told.append(f"tracers allow fewer than {planning.WORTH_VECTORS} along {', '.join(few)}: {limit}")
-    return "; ".join(told)
+        reported.append(f"tracers allow fewer than {planning.WORTH_VECTORS} along {', '.join(few)}: {limit}")
+    return "; ".join(reported)
 
 
 def _best_time_s(bench: Bench) -> float | None:

@@ -36,10 +36,10 @@ from lfpiv_cli.verbs.batches import Batch, BatchOptions, Expected, Worked, dry_r
 from lfpiv_cli.verbs.frames import (
     IMAGE,
     STILL,
-    Ahead,
     Bench,
     ImageOptions,
     Progress,
+    ReadAhead,
     bench_of,
     check_frame,
     frame_notices,
@@ -121,14 +121,14 @@ def volume_of(
         operator = operator.for_image(as_if_lit(image, excluded))
     sums = bench.sums_without(operator, excluded)
     result = solve(operator, image, bench.settings.solver_settings(), sums=sums, progress=progress)
-    told = content.reference.attributes() | {
+    reported = content.reference.attributes() | {
         "residual": result.residual,
         "excluded_pixels": int(np.count_nonzero(excluded)),
         "support_voxels": result.support_voxels,
     }
     grid = content.reference.grid_from_focal_point(content.weights.grid)
     array = content.weights.to_world(result.volume)
-    return Volume(array, grid, content.reference, attributes=told, provenance=dict(provenance))
+    return Volume(array, grid, content.reference, attributes=reported, provenance=dict(provenance))
 
 
 @dataclass(frozen=True)
@@ -204,7 +204,7 @@ class _Ready:
     """What all frames share: with particles their size, and what is said of it."""
 
     bench: Bench
-    ahead: Ahead
+    ahead: ReadAhead
     finder: Finder
     size: TracerSize | None
     said: Sequence[Notice]
@@ -321,7 +321,7 @@ class Reconstruction(Batch[Outcome]):
             said = size_notices(settings, size)
             console.warn(said)
         finder = Finder(bench, read, frames, self._beside, self._first_of, options.keep_going)
-        self._ready = _Ready(bench, Ahead(read, numbers), finder, size, said)
+        self._ready = _Ready(bench, ReadAhead(read, numbers), finder, size, said)
         if not self._as_particles:
             return settings.reconstruction.iterations
         looks = numbers if self._beside is None else {k for number in numbers for k in (number, *self._beside[number])}
@@ -340,11 +340,11 @@ class Reconstruction(Batch[Outcome]):
         if ready.size is None:
             made = with_warnings(made, notices)
             volume = volume_of(bench, *pictures, made, work.advance)
-            array, grid, reference, told = volume.array, volume.grid, volume.reference, volume.attributes
+            array, grid, reference, reported = volume.array, volume.grid, volume.reference, volume.attributes
             vtkhdf.write_volume(
-                target.path, array, grid, reference, provenance=made, attributes=told, overwrite=self._replace
+                target.path, array, grid, reference, provenance=made, attributes=reported, overwrite=self._replace
             )
-            return Outcome(float(told["residual"][-1]), told["excluded_pixels"])
+            return Outcome(float(reported["residual"][-1]), reported["excluded_pixels"])
         frame = particles.frame_of(bench, *pictures)
         found, alone = ready.finder.find(number, frame, work.advance)
         work.console.warn(alone)
@@ -358,14 +358,14 @@ class Reconstruction(Batch[Outcome]):
             image_files.write_tiff(residual_path(target.path), left.astype(np.float32), overwrite=True)
         points = replace(points, provenance=with_warnings(made, of_light))
         write_points(target.path, PARTICLES_FORMAT, points, overwrite=self._replace)
-        told = points.attributes
-        return Outcome(told["residual"], told["excluded_pixels"], len(points.position_mm), ready.size)
+        reported = points.attributes
+        return Outcome(reported["residual"], reported["excluded_pixels"], len(points.position_mm), ready.size)
 
     def summary(self, worked: Worked[Outcome]) -> dict[str, Any]:
         """Return what is told of the batch."""
         outcomes = list(worked.outcomes.values())
         found = [outcome.particles for outcome in outcomes if outcome.particles is not None]
-        told = {
+        reported = {
             "frames": worked.total(),
             "reconstructed": len(outcomes),
             "skipped": worked.skipped,
@@ -376,7 +376,7 @@ class Reconstruction(Batch[Outcome]):
         }
         counts = {"particles": sum(found), "particles_fewest": min(found)} if found else {}
         size = next((outcome.tracers for outcome in outcomes), None)
-        return told | counts | (size.summary() if size else {})
+        return reported | counts | (size.summary() if size else {})
 
     def _record(self, number: int) -> dict[str, Any]:
         """Return the record that a frame's result will carry."""

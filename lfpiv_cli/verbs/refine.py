@@ -70,8 +70,8 @@ def refine_calibration(
     if picture:
         ensure_drawing()
     before = open_calibration(calibration)
-    told = load_config(config)
-    settings = told.with_scene_of(before)
+    reported = load_config(config)
+    settings = reported.with_scene_of(before)
     scene = settings.scene_space()
     if settings.channel is None and scene is None:
         raise ConfigError(f"{config}: channel: is missing; the walls are known by the channel's width, or by a scene")
@@ -84,9 +84,9 @@ def refine_calibration(
         mended = found.applied(before)
     else:
         found = _scene(settings, scene, lit, before, console)
-        mended = found.applied(before, told.scene_fingerprint())
+        mended = found.applied(before, reported.scene_fingerprint())
     if output:
-        made_by = record("refine-calibration", told.resolved(), inputs)
+        made_by = record("refine-calibration", reported.resolved(), inputs)
         write_calibration(output, mended, made_by, overwrite)
     if picture:
         from lfpiv_cli.pictures.calibration import round_wall_figure, walls_figure

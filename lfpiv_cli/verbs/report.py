@@ -154,8 +154,8 @@ def report(
         advice = "Do not use these vectors before what is said below is mended."
     elif "look" in words.values():
         advice = "Look at what is said below before you use these vectors."
-    told = {part: "; ".join(each.reason for each in lines) for part, lines in judged.items()}
-    rows = tuple((part, words[part], told[part] or "nothing speaks against it") for part in judged)
+    reported = {part: "; ".join(each.reason for each in lines) for part, lines in judged.items()}
+    rows = tuple((part, words[part], reported[part] or "nothing speaks against it") for part in judged)
     verdict = Table("Verdict: good, look (at the reasons), or no", ("part", "verdict", "reasons"), rows)
     with TemporaryDirectory() as pictures:
         drawer = Drawer(contents, Path(pictures), {sha256(path): path for path in options.raw})
@@ -310,11 +310,11 @@ def _batch_table(paths: Iterable[Path], count: int, rows: Iterable[Row]) -> tupl
 
 
 def _volume_row(path: Path) -> Row:
-    told = read_header(path).attributes
-    residual = told.get("residual")
+    reported = read_header(path).attributes
+    residual = reported.get("residual")
     return {
         "light not explained": UNKNOWN if residual is None else written(np.atleast_1d(residual)[-1]),
-        "pixels left out": _cell(told.get("excluded_pixels")),
+        "pixels left out": _cell(reported.get("excluded_pixels")),
     }
 
 
@@ -322,20 +322,20 @@ def _particle_row(path: Path) -> Row:
     points = read_points(path, PARTICLES_FORMAT)
     inside = points.arrays["flag"] == 0
     sigma = np.sqrt(points.arrays["covariance_mm2"][inside, :3])
-    told = points.attributes
+    reported = points.attributes
     return {
         "particles": str(np.count_nonzero(inside)),
-        "per microlens": _cell(told.get("particles_per_lens")),
-        "light not explained": _cell(told.get("residual")),
+        "per microlens": _cell(reported.get("particles_per_lens")),
+        "light not explained": _cell(reported.get("residual")),
         "median sigma x, y, z (mm)": _cell(np.median(sigma, axis=0).tolist()) if inside.any() else UNKNOWN,
-        "diameter (mm)": _with_error(told, "particle_diameter", "mm"),
-        "diffusion (px)": _with_error(told, "diffusion", "px"),
+        "diameter (mm)": _with_error(reported, "particle_diameter", "mm"),
+        "diffusion (px)": _with_error(reported, "diffusion", "px"),
     }
 
 
-def _with_error(told: Mapping[str, Any], name: str, unit: str) -> str:
+def _with_error(reported: Mapping[str, Any], name: str, unit: str) -> str:
     """Return what a file tells of a number, with its standard error where it has one."""
-    value, error = told.get(f"{name}_{unit}"), told.get(f"{name}_sigma_{unit}")
+    value, error = reported.get(f"{name}_{unit}"), reported.get(f"{name}_sigma_{unit}")
     return _cell(value) if value is None or error is None else f"{written(value)} ± {written(error, 2)}"
 
 

@@ -75,7 +75,7 @@ class Choice:
     reason: str
     tracers_per_lens: float | None = None
 
-    def told(self) -> dict[str, Any]:
+    def reported(self) -> dict[str, Any]:
         """Return what is told of it."""
         method = self.methods[0] if len(self.methods) == 1 else "both"
         return {"method": method, "reason": self.reason, "tracers_per_lens": self.tracers_per_lens}
@@ -113,13 +113,13 @@ def _made(chain: Chain) -> dict[str, Any]:
         return steps.summary()
     choice = _chosen(chain.settings, options, lambda: _counted(chain, weights))
     steps.console.say(f"by {' and '.join(choice.methods)}: {choice.reason}")
-    steps.told.update(choice.told())
+    steps.reported.update(choice.reported())
     fields: dict[str, Vectors] = {method: chain.vectors_by(method, weights) for method in choice.methods}
     if options.combine:
         fields["combined"] = chain.combined(fields["volumes"], fields["particles"])
     figures = figures_of({method: list(paths.values()) for method, paths in fields.items()})
-    steps.told["figures"] = figures
-    told = choice.told() | figures
+    steps.reported["figures"] = figures
+    reported = choice.reported() | figures
     if options.report and options.shard == ALL:
         raw = (
             *dict.fromkeys(frame.path for frame in chain.frames if frame.fault is None),
@@ -136,17 +136,17 @@ def _made(chain: Chain) -> dict[str, Any]:
             replacing = chain.overwrite or bool(steps.earlier)
             return report(output, page, ReportOptions(raw=raw), overwrite=replacing, console=steps.console)
 
-        told |= {"verdict": steps.take("report", [page], make).get("verdict"), "report": str(page)}
+        reported |= {"verdict": steps.take("report", [page], make).get("verdict"), "report": str(page)}
     steps.write(whole=True)
-    told |= steps.summary()
+    reported |= steps.summary()
     # By both methods a frame fails twice.
     worked = Worked[None](failures=list(dict.fromkeys(chain.failures)))
     worked.list_failures(options.failures)
     if worked.failures:
         first, records = worked.failures[0], [asdict(failure) for failure in worked.failures]
         text = f"{len(records)} frames or pairs failed, the first {first.name}: {first.error}"
-        raise PartialError(text, told | {"failures": records})
-    return told
+        raise PartialError(text, reported | {"failures": records})
+    return reported
 
 
 def _ensure_possible(settings: Config, options: RunOptions) -> tuple[list[Frame], Pairs]:
@@ -200,14 +200,14 @@ def _ensure_settings(settings: Config, options: RunOptions) -> None:
     """Raise where the config lacks what a later step needs, or contradicts the methods that are asked for."""
     if options.dt_s is None and settings.correlation.dt_s is None:
         # Whether recordings say when each frame was taken, those that can be read.
-        told = []
+        reported = []
         for path in options.images:
             try:
-                told.append(image_files.frames(path).time_s is not None)
+                reported.append(image_files.frames(path).time_s is not None)
             except InputError:
                 if not options.keep_going:
                     raise
-        if not told or not all(told):
+        if not reported or not all(reported):
             raise ConfigError(
                 f"{settings.source}: correlation.dt_s: is missing, and velocities need it; give it there, or --dt-s"
             )
@@ -265,8 +265,8 @@ def _counted(chain: Chain, weights: Path) -> float | None:
     mask = "" if options.mask_file is None else sha256(options.mask_file)
     words = other_frames(level, frames)(first)
     counted_from = " ".join([*map(sha256, files), str(frames[first].page), mask, words])
-    steps.told["counted_from"] = hashlib.sha256(counted_from.encode()).hexdigest()
-    if steps.earlier.get("counted_from") == steps.told["counted_from"] and "tracers_per_lens" in steps.earlier:
+    steps.reported["counted_from"] = hashlib.sha256(counted_from.encode()).hexdigest()
+    if steps.earlier.get("counted_from") == steps.reported["counted_from"] and "tracers_per_lens" in steps.earlier:
         return cast("float | None", steps.earlier["tracers_per_lens"])
     content = chain.prepared.searchable(weights, settings)
     shape = content.image_shape
@@ -299,43 +299,43 @@ def planned(chain: Chain) -> dict[str, Any]:
         return counts | _from_nothing(chain)
     weights, to_come = output / WEIGHTS, _weights_to_come(chain)
     methods = _chosen(settings, options, lambda: _counted(chain, weights)).methods
-    told: dict[str, dict[str, Any]] = {}
+    reported: dict[str, dict[str, Any]] = {}
     for method in methods:
         if options.follow:
             # The frames of a sequence depend on the whole config.
             chosen = replace(chain.following(dry_run=True), resume=to_come is None)
-            told[method] = follow_particles(weights, options.images, output, chosen, **chain.common)
+            reported[method] = follow_particles(weights, options.images, output, chosen, **chain.common)
             continue
         found = chain.reconstruction(method, weights, to_come)
         in_time = method == "particles" and not chain.pairs.separate
         if options.keep == "all" or in_time:
-            told[method] = dry_run(found, chain.batch_options(shared=False), console)
+            reported[method] = dry_run(found, chain.batch_options(shared=False), console)
         if not in_time:
             size = field_bytes(settings, settings.grid()) if method == "volumes" else None
             batch = chain.in_pairs(method, found, size)
-            told[RESULTS[method]] = dry_run(batch, chain.batch_options(shared=True), console)
-    return counts | {"method": " and ".join(methods)} | _together(told)
+            reported[RESULTS[method]] = dry_run(batch, chain.batch_options(shared=True), console)
+    return counts | {"method": " and ".join(methods)} | _together(reported)
 
 
 def with_overwrite(chain: Chain) -> str:
     """Return in words what a run that may overwrite makes again and what it keeps; nothing where that is not known."""
     try:
-        told = planned(chain)
+        reported = planned(chain)
     except LfpivError:
         return ""
     before = {"calibrate-snapshot": CALIBRATION, "build-weights": WEIGHTS}
-    again = [before[step] for step in told["steps_to_make"]]
+    again = [before[step] for step in reported["steps_to_make"]]
     kept = [name for name in before.values() if name not in again]
     if again:
         again.append("what depends on it")
     else:
-        for folder, number in told["to_make"].items():
+        for folder, number in reported["to_make"].items():
             # With how many of a folder's files are meant, unless all are.
-            skipped = told["skipped"][folder]
+            skipped = reported["skipped"][folder]
             again += [f"{number} of {number + skipped} {folder}" if skipped else folder] if number else []
             kept += [f"{skipped} of {number + skipped} {folder}" if number else folder] if skipped else []
-        in_time = "particles" in told["to_make"] and not chain.pairs.separate
-        if in_time and (told["to_make"]["particles"] or _weights_to_come(chain) is not None):
+        in_time = "particles" in reported["to_make"] and not chain.pairs.separate
+        if in_time and (reported["to_make"]["particles"] or _weights_to_come(chain) is not None):
             again.append("tracks")
         if again and chain.options.combine:
             again.append("combined")
@@ -373,7 +373,7 @@ def _from_nothing(chain: Chain) -> dict[str, Any]:
         "volumes": (FLOAT_BYTES * math.prod(grid.shape_xyz), field_bytes(settings, grid)),
         "particles": (None, None),
     }
-    told = {}
+    reported = {}
     counts = ((len(chain.order), len(good)), (len(chain.share), len(whole)))
     for method in methods:
         names = ((method, "reconstruct"), (RESULTS[method], "correlate" if method == "volumes" else "track"))
@@ -383,33 +383,33 @@ def _from_nothing(chain: Chain) -> dict[str, Any]:
                 continue  # the files of a pair at a time
             made_by, numbers = "reconstruct" if dropped else label, {"to_make": count, "skipped": 0}
             numbers["unreadable"] = given - count
-            told[folder] = estimate(made_by, numbers, (), Expected(size, held), chain.steps.output, console)
+            reported[folder] = estimate(made_by, numbers, (), Expected(size, held), chain.steps.output, console)
     told_method = f"{asked}, reckoned as volumes" if asked == "auto" else asked
     built = {"weights_mb": None if cost is None else cost.weights_bytes / MB}
-    return {"method": told_method} | built | _together(told)
+    return {"method": told_method} | built | _together(reported)
 
 
-def _together(told: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+def _together(reported: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
     """Return what several batches tell: the counts of each, the sums of disk and time, the most of memory."""
-    working = [each for each in told.values() if each["to_make"]]
+    working = [each for each in reported.values() if each["to_make"]]
     figures: dict[str, Any] = {
-        key: {name: each[key] for name, each in told.items()} for key in ("to_make", "skipped", "unreadable")
+        key: {name: each[key] for name, each in reported.items()} for key in ("to_make", "skipped", "unreadable")
     }
     for key, by in (("disk_mb", "disk_by"), ("seconds", "seconds_by")):
         # A sum is known where all its parts are.
         known = [each[key] for each in working]
         figures |= {key: None if None in known else sum(known), by: _words(by, working)}
         if key == "disk_mb":
-            figures["disk_free_mb"] = next(iter(told.values()))["disk_free_mb"]
+            figures["disk_free_mb"] = next(iter(reported.values()))["disk_free_mb"]
     memory = [each["memory_mb"] for each in working if each["memory_mb"] is not None]
     figures |= {"memory_mb": max(memory, default=None), "memory_by": _words("memory_by", working)}
-    listed = [path for each in told.values() for path in each.get("would_make", ())]
+    listed = [path for each in reported.values() for path in each.get("would_make", ())]
     return figures | ({"would_make": listed} if listed else {})
 
 
-def _words(key: str, told: Sequence[Mapping[str, Any]]) -> str | None:
+def _words(key: str, reported: Sequence[Mapping[str, Any]]) -> str | None:
     """Return all the ways in which a figure is known."""
-    return "; ".join(dict.fromkeys(each[key] for each in told if each[key])) or None
+    return "; ".join(dict.fromkeys(each[key] for each in reported if each[key])) or None
 
 
 # Warming up is a small experiment, in which every step is taken once, so that all kernels are compiled.

@@ -19,7 +19,7 @@ from lfpiv_cli.files.atomic import write_json
 from lfpiv_cli.files.batch import VTKHDF_SUFFIX, Frame, Target
 from lfpiv_cli.files.config import Config
 from lfpiv_cli.files.pairing import Pairs
-from lfpiv_cli.files.provenance import Gone, bear_alike, carried_record, sha256
+from lfpiv_cli.files.provenance import Gone, carried_record, same_result, sha256
 from lfpiv_cli.files.shares import Deadline, awaited
 from lfpiv_cli.names import FlowMethod, Kept, RunMethod
 from lfpiv_cli.verbs import correlate as correlating
@@ -53,7 +53,7 @@ class Steps:
     earlier : what `run.json` said before
     deadline : when all steps have to be done
     recorded : whether they are written down; of several shards none can tell of all
-    told : what it says now
+    reported : what it says now
     files : what all steps have made or kept
     """
 
@@ -62,7 +62,7 @@ class Steps:
     earlier: Mapping[str, Any]
     deadline: Deadline = field(default_factory=Deadline)
     recorded: bool = True
-    told: dict[str, Any] = field(default_factory=lambda: {"steps": {}, "summaries": {}})
+    reported: dict[str, Any] = field(default_factory=lambda: {"steps": {}, "summaries": {}})
     files: list[Path] = field(default_factory=list)
 
     def take(self, name: str, files: Sequence[Path], make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
@@ -73,7 +73,7 @@ class Steps:
         LfpivError : as the step does, with its name and what becomes of the steps before
         StoppedEarlyError : the time is over
         """
-        number = len(self.told["steps"]) + 1
+        number = len(self.reported["steps"]) + 1
         if not self.deadline.leaves_time():
             raise StoppedEarlyError(
                 f"stopped before step {number}, {name}: the time limit of {self.deadline.limit_s:g} s is over; the "
@@ -94,8 +94,8 @@ class Steps:
             self.console.say(f"step {number}: {state}, {why}")
             if self.earlier.get("steps", {}).get(name, {}).get("files") == hashes:
                 summary = self.earlier.get("summaries", {}).get(name, summary)
-        self.told["steps"][name] = {"state": state, "files": self._hashes(files)}
-        self.told["summaries"][name] = summary
+        self.reported["steps"][name] = {"state": state, "files": self._hashes(files)}
+        self.reported["summaries"][name] = summary
         self.files.extend(files)
         self.write()
         return summary
@@ -106,7 +106,7 @@ class Steps:
 
     def count(self, state: str) -> int:
         """Return how many steps were made, kept, or recorded anew."""
-        return sum(step["state"] == state for step in self.told["steps"].values())
+        return sum(step["state"] == state for step in self.reported["steps"].values())
 
     def summary(self) -> dict[str, Any]:
         """Return what is told of the steps."""
@@ -119,16 +119,16 @@ class Steps:
         """
         if not self.recorded:
             return
-        told = dict(self.told)
+        reported = dict(self.reported)
         for part in () if whole else ("steps", "summaries"):
-            told[part] = self.earlier.get(part, {}) | self.told[part]
+            reported[part] = self.earlier.get(part, {}) | self.reported[part]
         # What was warned of, in this run and when what it kept was made.
         recorded = [warning for path in self.files for warning in (_recorded(path) or {}).get("warnings", ())]
-        told["warnings"] = []
+        reported["warnings"] = []
         for warning in (*recorded, *(notice.record() for notice in self.console.warned or ())):
-            if warning not in told["warnings"]:
-                told["warnings"].append(warning)
-        write_json(self.output / RECORD, told, overwrite=True)
+            if warning not in reported["warnings"]:
+                reported["warnings"].append(warning)
+        write_json(self.output / RECORD, reported, overwrite=True)
 
 
 def earlier_run(output: Path, overwrite: bool) -> dict[str, Any]:
@@ -140,11 +140,11 @@ def earlier_run(output: Path, overwrite: bool) -> dict[str, Any]:
     """
     path = output / RECORD
     try:
-        told = json.loads(path.read_text(encoding="utf-8"))
+        reported = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):
-        told = None
-    if isinstance(told, dict) and isinstance(told.get("steps"), dict):
-        return told
+        reported = None
+    if isinstance(reported, dict) and isinstance(reported.get("steps"), dict):
+        return reported
     if path.exists() and not overwrite:
         raise OutputExistsError(f"{path}: exists, and is not of a run (use --overwrite to replace it)")
     return {}
@@ -155,7 +155,7 @@ def _state(files: Sequence[Path], before: Sequence[Mapping[str, Any] | None], ti
     if list(times) == [stamp_of(path) for path in files]:
         return KEPT
     records = [(old, _recorded(path)) for path, old in zip(files, before, strict=True) if path.suffix in OURS]
-    alike = bool(records) and all(old and new and old != new and bear_alike(old, new) for old, new in records)
+    alike = bool(records) and all(old and new and old != new and same_result(old, new) for old, new in records)
     return RECORDED if alike else MADE
 
 
@@ -286,11 +286,11 @@ class Chain:
         paths = {number: every[number] for number in first if number in second}
 
         def combine_all() -> dict[str, Any]:
-            told = {
+            reported = {
                 path.stem: combine_vectors(first[number], second[number], path, resume=True, **self.common)
                 for number, path in paths.items()
             }
-            return next(iter(told.values())) if len(told) == 1 else told
+            return next(iter(reported.values())) if len(reported) == 1 else reported
 
         self.steps.take("combine", list(paths.values()), combine_all)
         return paths

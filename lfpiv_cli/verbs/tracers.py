@@ -38,14 +38,14 @@ class Diffusion:
     px : that particles are fitted with by waves
     measured_px, sigma_px : by the tracers' images, and its standard error; None where no image shows it
     given : whether it is given
-    told : whether the images tell it, not what is usual
+    reported : whether the images tell it, not what is usual
     """
 
     px: float
     measured_px: float | None = None
     sigma_px: float | None = None
     given: bool = False
-    told: bool = False
+    reported: bool = False
 
     def attributes(self) -> dict[str, float]:
         """Return what files say of it: its standard error where it is not given."""
@@ -90,10 +90,10 @@ class TracerSize:
 
     def attributes(self) -> dict[str, float]:
         """Return what files say of it: its standard error where it is by the images."""
-        told = {"particle_diameter_mm": self.diameter_mm}
+        reported = {"particle_diameter_mm": self.diameter_mm}
         if self.sigma_mm is not None and self.diameter_mm == self.measured_mm:
-            told["particle_diameter_sigma_mm"] = self.sigma_mm
-        return told | (self.diffusion.attributes() if self.diffusion else {})
+            reported["particle_diameter_sigma_mm"] = self.sigma_mm
+        return reported | (self.diffusion.attributes() if self.diffusion else {})
 
     def summary(self) -> dict[str, float | None]:
         """Return what is told of it; None where it is not known."""
@@ -106,7 +106,10 @@ class TracerSize:
 
 def size_notices(settings: Config, size: TracerSize) -> list[Notice]:
     """Return where diameter and diffusion as given contradict the images, these each other, or where none tells."""
-    told = [*_diameter_notices(settings, size), *([] if size.diffusion is None else _diffusion_notices(size.diffusion))]
+    reported = [
+        *_diameter_notices(settings, size),
+        *([] if size.diffusion is None else _diffusion_notices(size.diffusion)),
+    ]
     diameters = [(each.measured_mm, each.sigma_mm) for each in size.frames]
     diffusions = [(each.diffusion.measured_px, each.diffusion.sigma_px) for each in size.frames if each.diffusion]
     for key, unit, values in (("particle_diameter_mm", "mm", diameters), ("diffusion_px", "px", diffusions)):
@@ -118,16 +121,16 @@ def size_notices(settings: Config, size: TracerSize) -> list[Notice]:
                     f"{written(other)} ± {written(other_sigma, 2)} {unit} by another, which contradict each other"
                 )
                 remedy = "check focus, exposure and the laser's light in either image; or give it, if it is known"
-                told.append(
+                reported.append(
                     Notice("images-differ", f"reconstruction.{key}", text, remedy, one, f"{written(other)} {unit}")
                 )
-    return told
+    return reported
 
 
 def _diffusion_notices(found: Diffusion) -> list[Notice]:
     """Return where a given diffusion contradicts the images, or where they do not tell it."""
     key = "reconstruction.diffusion_px"
-    if found.measured_px is None or found.sigma_px is None or not found.told:
+    if found.measured_px is None or found.sigma_px is None or not found.reported:
         text = f"the images do not tell how far charge diffuses: {written(found.px)} px is taken"
         remedy = "give it, or tracers that stand alone at several depths"
         return [] if found.given else [Notice("diffusion-unknown", key, text, remedy, found.sigma_px, None)]

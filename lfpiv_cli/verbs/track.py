@@ -187,10 +187,10 @@ class Tracks(PairBatch[Outcome, TrackOptions]):
         chosen = tracking_of(settings, self._options.search_voxel, self._options.shortest, len(paths), names[0])
         with _tracks(paths, read, settings, chosen, dict(target.record), target.path.parent) as found:
             roles = zip(_roles(paths).items(), records, strict=True)
-            told = {f"{role} {path.name}": made for (role, path), made in roles}
+            reported = {f"{role} {path.name}": made for (role, path), made in roles}
             doubts = dt_notices(chosen.dt_s, pairwise(records), paths[0].name)
             few = checks.few_notices(counts, [path.name for path in paths], found.summary, found.points)
-            notices = [*doubts, *checks.calibration_notices(told), *few]
+            notices = [*doubts, *checks.calibration_notices(reported), *few]
             work.console.warn(notices)
             provenance = with_warnings(found.points.provenance, notices)
             # What is complete is skipped: in the place of what is made there is nothing, or something broken.
@@ -229,29 +229,29 @@ class Tracks(PairBatch[Outcome, TrackOptions]):
         records = [self._gone[path].record if path in self._gone else carried_record(path) for path in paths]
         settings = settings_of(records, names, options.dt_s)
         chosen = tracking_of(settings, options.search_voxel, options.shortest, len(paths), names[0])
-        told = chosen.told() | ({"grid_by": options.by} if options.grid and options.by != "polynomials" else {})
-        return record("track", settings.resolved() | told, _roles(paths), gone=self._gone)
+        reported = chosen.reported() | ({"grid_by": options.by} if options.grid and options.by != "polynomials" else {})
+        return record("track", settings.resolved() | reported, _roles(paths), gone=self._gone)
 
 
 def summary_of(worked: Worked[Outcome], paths: Sequence[Path]) -> dict[str, Any]:
     """Return what is told of so many files of tracks."""
     outcomes = list(worked.outcomes.values())
     if len(paths) == 1:
-        told = outcomes[0].figures if outcomes else {"tracks": 0}
+        reported = outcomes[0].figures if outcomes else {"tracks": 0}
         if not outcomes and paths[0].exists():
             # Of two frames, or of a sequence, which has a place for each frame of a track.
             points = particle_file.open_tracks(paths[0])
             number = points.arrays.get("track")
-            told = {"tracks": len(points.position_mm) if number is None else len(np.unique(number))}
+            reported = {"tracks": len(points.position_mm) if number is None else len(np.unique(number))}
     else:
         tracks = sum(outcome.figures["tracks"] for outcome in outcomes)
-        told = {"pairs": len(paths), "skipped": worked.skipped, "tracks": tracks}
+        reported = {"pairs": len(paths), "skipped": worked.skipped, "tracks": tracks}
     qualities = [quality for outcome in outcomes for quality in outcome.qualities]
     if not qualities:
-        return told
+        return reported
     every = checks.quality_of_all(qualities)
     rejected = sum(outcome.rejected for outcome in outcomes)
-    return told | {"vectors": every.vectors, "rejected": rejected} | every.summary()
+    return reported | {"vectors": every.vectors, "rejected": rejected} | every.summary()
 
 
 def grid_paths(output: Path, intervals: int) -> list[Path]:

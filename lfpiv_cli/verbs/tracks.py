@@ -139,7 +139,7 @@ def track(
     counts = [len(each.position_mm) for each in particles]
     ensure_particles(counts, names)
     chosen = tracking_of(settings, search_voxel, shortest, len(particles), names[0])
-    found = tracked(particles, settings, chosen, record("track", settings.resolved() | chosen.told(), {}))
+    found = tracked(particles, settings, chosen, record("track", settings.resolved() | chosen.reported(), {}))
     warn_of(few_notices(counts, names, found.summary, found.points))
     return found
 
@@ -161,10 +161,10 @@ class Tracking:
     shortest: int | None
     scale: Scale
 
-    def told(self) -> dict[str, Any]:
+    def reported(self) -> dict[str, Any]:
         """Return what a record says of it beside the config."""
-        told: dict[str, Any] = {"search_mm": self.search_mm}
-        return told if self.shortest is None else told | {"shortest": self.shortest}
+        reported: dict[str, Any] = {"search_mm": self.search_mm}
+        return reported if self.shortest is None else reported | {"shortest": self.shortest}
 
     def attributes(self, reference: Reference) -> dict[str, Any]:
         """Return what a file of tracks says of itself besides its provenance."""
@@ -283,11 +283,11 @@ def tracked(
     found: Trajectories | None = None,
 ) -> Tracked:
     """Follow particles from frame to frame; where a sequence has been followed already, `found` says how."""
-    reference, told = frames[0].reference, chosen.attributes(frames[0].reference)
+    reference, reported = frames[0].reference, chosen.attributes(frames[0].reference)
     if chosen.shortest is not None:
         sequence = tracks_through([seen_in(frame) for frame in frames], chosen, found)
         arrays, summary, paths = sequence.by_track(), sequence.summary(), sequence.paths
-        points = Points(arrays.pop(POSITION), arrays, reference, told, provenance)
+        points = Points(arrays.pop(POSITION), arrays, reference, reported, provenance)
         return Tracked(points, TRAJECTORIES_FORMAT, paths, summary, settings)
     first, second = frames
     links = match(seen_in(first), seen_in(second), chosen.search_mm, chosen.scale)
@@ -314,7 +314,7 @@ def tracked(
     if len(links.first):
         before, after = first.arrays["intensity"][links.first], second.arrays["intensity"][links.second]
         summary["light_b_over_a"] = float(np.median(after / before))
-    points = Points(path.middle_mm, arrays, reference, told, provenance)
+    points = Points(path.middle_mm, arrays, reference, reported, provenance)
     return Tracked(points, TRACKS_FORMAT, lambda: iter([path]), summary, settings)
 
 

@@ -72,14 +72,14 @@ class Content:
     attributes: dict[str, Any]
     provenance: dict[str, Any]
 
-    def told(self) -> dict[str, Any]:
+    def reported(self) -> dict[str, Any]:
         """Return what is told besides the arrays: the format, the attributes, and the provenance as JSON."""
         known = {name: value for name, value in self.attributes.items() if value is not None}
         return {"format": self.format_name, **known, "provenance": json.dumps(self.provenance)}
 
     def comments(self, units: Mapping[str, str]) -> Iterator[str]:
         """Yield the same as lines of comments, the provenance as JSON over as many as it needs; the units last."""
-        for name, value in self.told().items():
+        for name, value in self.reported().items():
             if name != "provenance":
                 yield f"# {name}: {json.dumps(value)}"
         yield "# provenance:"
@@ -171,7 +171,7 @@ def write_netcdf(path: Path, contents: Sequence[Content], times_s: Sequence[floa
 
     first = contents[0]
     with netcdf_file(path, "w", version=2) as file:
-        for name, value in first.told().items():
+        for name, value in first.reported().items():
             setattr(file, name, _attribute(value))
         if first.grid is None:
             file.createDimension("point", len(next(iter(first.arrays.values()))))
@@ -281,7 +281,7 @@ def write_mat(path: Path, content: Content) -> None:
         variables["tracks"] = _tracks(content)
     if content.grid is not None:
         variables |= {axis: content.grid.axis_mm(k) for k, axis in enumerate("xyz")}
-    variables |= content.arrays | content.told() | {"units": content.units}
+    variables |= content.arrays | content.reported() | {"units": content.units}
     savemat(path, variables, appendmat=False, format="5", long_field_names=True, oned_as="column")
     with open(path, "rb+") as file:
         file.write(WORDS)

@@ -95,7 +95,7 @@ def _cells(name: str, begins: NDArray[np.int64], appended: list[NDArray[Any]]) -
 def _field_data(content: Content) -> str:
     """Return what the file says about itself, as arrays of text and numbers."""
     fields = []
-    for name, value in content.told().items():
+    for name, value in content.reported().items():
         if isinstance(value, str):
             # Text is stored as the numbers of its bytes, and ends with a zero.
             kind, count, numbers = "String", 1, " ".join(map(str, [*value.encode(), 0]))
@@ -202,8 +202,8 @@ def write_series(
     times, unit = (list(map(float, range(count))), "frame") if times_s is None else (times_s, "s")
 
     with created(path, overwrite=overwrite) as file:
-        told = {name: np.asarray(value) if isinstance(value, list) else value for name, value in others.items()}
-        write_root(file, SERIES_FORMAT, SERIES_VERSION, reference, told, provenance)
+        reported = {name: np.asarray(value) if isinstance(value, list) else value for name, value in others.items()}
+        write_root(file, SERIES_FORMAT, SERIES_VERSION, reference, reported, provenance)
         vtk = create_vtk_group(file, grid)
         points = vtk.create_group("PointData")
         if "velocity" in first.arrays:

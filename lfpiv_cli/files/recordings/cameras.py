@@ -68,7 +68,7 @@ def mraw_frames(path: Path) -> Recording:
     if header.suffix.lower() == ".cih":
         lines = (line.split(" : ", 1) for line in content.decode("latin-1").splitlines())
         words = {line[0].strip(): line[1].strip() for line in lines if len(line) == 2}
-        told = {name: words.get(word) for name, (word, _) in NAMES.items()}
+        reported = {name: words.get(word) for name, (word, _) in NAMES.items()}
     else:
         # The XML lies between bytes of the camera's own, without what could declare entities.
         inside = re.search(rb"<cih>.*</cih>", content, re.DOTALL)
@@ -78,8 +78,8 @@ def mraw_frames(path: Path) -> Recording:
             tree = ElementTree.fromstring(inside.group().decode("utf-8", errors="replace"))
         except (ElementTree.ParseError, ValueError) as error:
             raise InputError(f"{header}: is not XML: {reason(error)}") from error
-        told = {name: tree.findtext(place) for name, (_, place) in NAMES.items()}
-    found = {name: text.strip() for name, text in told.items() if text is not None}
+        reported = {name: tree.findtext(place) for name, (_, place) in NAMES.items()}
+    found = {name: text.strip() for name, text in reported.items() if text is not None}
 
     colour = found.get("colour", MONO).lower()
     if colour != MONO:

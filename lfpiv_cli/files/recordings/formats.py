@@ -365,8 +365,8 @@ def _frames_in(path: Path, dataset: h5py.Dataset) -> Recording:
     pages, time_s = int(dataset.shape[0]) if dataset.ndim == 3 else 1, None
     times = member(dataset.parent, TIMES) if TIMES in dataset.parent else None
     if isinstance(times, h5py.Dataset) and times.shape == (pages,) and times.dtype.kind in "uif":
-        told = np.asarray(times[()], np.float64)
-        time_s = told if np.isfinite(told).all() else None
+        reported = np.asarray(times[()], np.float64)
+        time_s = reported if np.isfinite(reported).all() else None
     return Recording(pages, shape, 8 * item_bytes, partial(_read_dataset, path, name), time_s)
 
 
