@@ -32,7 +32,7 @@ import tifffile
 import yaml
 
 from lfpiv_cli.errors import LfpivError
-from lfpiv_cli.files.config import load_config
+from lfpiv_cli.files.config import load_rig
 from lfpiv_cli.files.hdf5 import DIGEST, write_digest
 from lfpiv_cli.files.images import count_pages, read_image
 from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, UNITS, Points, read_points, write_points
@@ -273,7 +273,7 @@ def whole_results() -> dict[str, bytes]:
 
 def read_config(path: Path) -> object:
     """Read a config and make of it what the commands do."""
-    config = load_config(path)
+    config = load_rig(path)
     camera, media = config.camera_model(), config.media_model()
     return repr((config.resolved(), camera.scale(media), config.grid()))
 

@@ -33,7 +33,7 @@ from benchmarks.rig_drawing import DrawnRig, draw
 from benchmarks.rig_judging import Figures, judge_particles, judge_tracks, judge_vectors, truth_of
 from lfpiv_cli.cli.main import cli
 from lfpiv_cli.errors import LfpivError
-from lfpiv_cli.files.config import load_config
+from lfpiv_cli.files.config import load_rig
 from lfpiv_cli.files.images import read_image, write_tiff
 from lfpiv_cli.synthetic.render import render_white
 from lfpiv_cli.verbs.simulate import readout_of, real_camera
@@ -142,7 +142,7 @@ def experiment(rig: DrawnRig, folder: Path, outcome: Outcome, volumes: bool) -> 
             outcome.steps.append(step)
             return
     soil(images, rig)
-    truth = truth_of(load_config(true), images)
+    truth = truth_of(load_rig(true), images)
 
     def done(*arguments: object) -> bool:
         outcome.steps.append(run_command(*arguments))
@@ -189,7 +189,7 @@ def run_command(*arguments: object) -> Step:
 
 def photograph_white(config: Path, images: Path) -> None:
     """Write a white and a dark image, as `simulate white` does in ten times as long."""
-    settings = load_config(config)
+    settings = load_rig(config)
     camera, readout = real_camera(settings), readout_of(settings)
     rng = np.random.default_rng([settings.simulation.seed, 0])
     light = render_white(camera, settings.simulation.peak_counts, WHITE_SAMPLES)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from lfpiv_cli.files.config import load_config
+from lfpiv_cli.files.config import load_rig
 from lfpiv_cli.optics.tracing import ObjectSpace
 from lfpiv_cli.optics.waves import Waves
 from lfpiv_cli.pictures.style import new_figure, styled
@@ -22,7 +22,7 @@ RAYS = 2_000_000
 
 def images(config: Path, diameter_mm: float) -> dict[str, NDArray[np.float64]]:
     """Return what rays, blurred rays and waves make of one tracer, by their names."""
-    settings = load_config(config)
+    settings = load_rig(config)
     camera = replace(settings.camera_model(), columns=SIDE_PX, rows=SIDE_PX)
     space = ObjectSpace(settings.media_model(), settings.window_model(), "exact")
     ball = Balls(np.array([[*PLACE_MM, DEPTH_MM]]), 1.0, diameter_mm)

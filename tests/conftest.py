@@ -14,7 +14,7 @@ import pytest
 import tifffile
 from numpy.typing import NDArray
 
-from lfpiv_cli.files.config import load_config
+from lfpiv_cli.files.config import load_rig
 from lfpiv_cli.files.images import read_image
 from lfpiv_cli.files.provenance import record
 from lfpiv_cli.files.vtkhdf import write_volume
@@ -106,7 +106,7 @@ def images(tmp_path: Path, raw: NDArray[np.uint16]):
 def pairs(tmp_path_factory: pytest.TempPathFactory):
     """Two pairs of small volumes."""
     folder, rng = tmp_path_factory.mktemp("pairs"), np.random.default_rng(5)
-    made = {"provenance": record("test", load_config(CONFIG).resolved(), {}), "attributes": {}, "overwrite": False}
+    made = {"provenance": record("test", load_rig(CONFIG).resolved(), {}), "attributes": {}, "overwrite": False}
     grid = Grid.centred((12, 12, 12), (0.1,) * 3, (0.0,) * 3)
     paths = [folder / f"{name}.vtkhdf" for name in ("a0", "b0", "a1", "b1")]
     for path in paths:

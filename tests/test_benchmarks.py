@@ -30,7 +30,7 @@ from benchmarks.surfaces import rates
 from benchmarks.volumes import Seeding, volume_pair
 from benchmarks.weights import sparse_matrix
 from lfpiv_cli.errors import InputError
-from lfpiv_cli.files.config import load_config
+from lfpiv_cli.files.config import load_rig
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media
@@ -194,7 +194,7 @@ def test_configs_of_drawn_rigs_are_accepted(number: int, tmp_path: Path) -> None
     for name, tree in (("true", rig.true), ("told", rig.reported)):
         path = tmp_path / f"{name}.yaml"
         path.write_text(json.dumps(tree))
-        load_config(path)
+        load_rig(path)
     assert (rig.reported == {key: value for key, value in rig.true.items() if key != "simulation"}) == (rig.wrong == "")
 
 

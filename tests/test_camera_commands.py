@@ -16,7 +16,7 @@ from click.testing import CliRunner
 from lfpiv_cli.cli.main import cli
 from lfpiv_cli.errors import ConfigError, InputError
 from lfpiv_cli.files.batch import frames_of
-from lfpiv_cli.files.config import load_config
+from lfpiv_cli.files.config import load_rig
 from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, open_tracks, read_points, write_points
 from lfpiv_cli.files.provenance import carried_record, even_step_s, seconds_between, sha256
 from lfpiv_cli.files.vtkhdf import open_vectors, open_volume
@@ -220,7 +220,7 @@ def pair(tmp_path: Path, rng: np.random.Generator) -> list[Path]:
     """Particles of two frames that were recorded 4 ms apart, and whose config has no time."""
     start = rng.uniform((-1.5, -1.1, -2.0), (1.5, 1.1, 2.0), (40, 3))
     paths = [tmp_path / "a.vtkhdf", tmp_path / "b.vtkhdf"]
-    resolved = load_config(CONFIG).resolved()
+    resolved = load_rig(CONFIG).resolved()
     for k, path in enumerate(paths):
         write_frame(path, start + 0.1 * k, correlation=resolved["correlation"] | {"dt_s": None})
         points = read_points(path, PARTICLES_FORMAT)
@@ -254,10 +254,10 @@ def test_run_needs_no_time_where_the_images_tell_it(tmp_path: Path) -> None:
     stack = np.random.default_rng(1).integers(0, 4000, (4, 45, 60)).astype(np.uint16)
     write_cine(tmp_path / "run.cine", stack)
     options = RunOptions(images=[tmp_path / "run.cine"], white=[tmp_path / "run.cine"], report=False, pairing="ab")
-    _, pairs = run_stage._ensure_possible(load_config(settings), options)
+    _, pairs = run_stage._ensure_possible(load_rig(settings), options)
     assert pairs.pairs == ((0, 1), (2, 3))
-    followed = run_stage._ensure_possible(load_config(settings), replace(options, follow=True))[1]
+    followed = run_stage._ensure_possible(load_rig(settings), replace(options, follow=True))[1]
     assert followed.pairs == ((0, 1), (1, 2), (2, 3))
     tifffile.imwrite(tmp_path / "run.tif", stack, photometric="minisblack")
     with pytest.raises(ConfigError, match="dt_s: is missing"):
-        run_stage._ensure_possible(load_config(settings), replace(options, images=[tmp_path / "run.tif"]))
+        run_stage._ensure_possible(load_rig(settings), replace(options, images=[tmp_path / "run.tif"]))

@@ -15,7 +15,7 @@ import pytest
 import lfpiv_cli as lf
 from lfpiv_cli.cli.main import cli
 from lfpiv_cli.errors import ConfigError, InputError, LimitMissedError, UsageError
-from lfpiv_cli.files.config import load_config
+from lfpiv_cli.files.config import load_rig
 from lfpiv_cli.files.images import write_tiff
 from lfpiv_cli.files.particles import read_particles
 from lfpiv_cli.files.vtkhdf import open_vectors, open_volume
@@ -60,7 +60,7 @@ def test_calibration_finds_what_was_simulated(chain, capsys) -> None:
 
 def test_light_is_reconstructed_where_the_particles_are(chain) -> None:
     volume = open_volume(chain / "volumes" / "pair_a.vtkhdf")
-    settings = load_config(CONFIG)
+    settings = load_rig(CONFIG)
     particles = read_particles(SAMPLE / "particles.npz")
     start = particles.positions_mm - particles.velocities_m_s * 1e3 * 0.5 * settings.correlation.dt_s
     start[:, 2] -= truth("particles")["reference_z_mm"]

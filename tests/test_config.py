@@ -14,7 +14,7 @@ import pytest
 import yaml
 
 from lfpiv_cli.errors import ConfigError
-from lfpiv_cli.files.config import Config, load_config
+from lfpiv_cli.files.config import Config, load_rig
 from lfpiv_cli.files.sections import Section
 from lfpiv_cli.files.sections_work import Sections
 from lfpiv_cli.flow.windows import ParallelWalls, RoundWall, layout_windows
@@ -51,20 +51,20 @@ def write(tmp_path: Path) -> Callable[[str], Path]:
 def refusal(path: Path) -> str:
     """Return the message with which a config is refused."""
     with pytest.raises(ConfigError) as caught:
-        load_config(path)
+        load_rig(path)
     return str(caught.value)
 
 
 @pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.stem)
 def test_shipped_configs_load_and_return_from_json(path: Path) -> None:
-    config = load_config(path)
+    config = load_rig(path)
     again = Config.from_resolved(json.loads(json.dumps(config.resolved(), allow_nan=False)))
     assert again.sections == config.sections
 
 
 def test_table2_is_shipped_and_gives_the_papers_camera(table2: Camera) -> None:
     assert {path.stem for path in CONFIGS} >= {"table2", "channel", "sample", "seaurchin", "guv"}
-    camera = load_config(CONFIGS[[path.stem for path in CONFIGS].index("table2")]).camera_model()
+    camera = load_rig(CONFIGS[[path.stem for path in CONFIGS].index("table2")]).camera_model()
     for name in ("image_distance_mm", "focus_distance_mm", "aperture_mm", "pixel_mm", "columns", "rows"):
         assert getattr(camera, name) == pytest.approx(getattr(table2, name))
     np.testing.assert_array_equal(camera.lattice.basis, table2.lattice.basis)
@@ -182,7 +182,7 @@ def test_impossible_physics_is_named_with_its_numbers(tmp_path: Path, old: str, 
 def test_total_reflection_is_named_with_its_numbers(write) -> None:
     """At the rim of a lens of radius 225 mm, 200 mm away, sin is 0.747: in oil (1.5), n sin = 1.12."""
     wide = RIG.replace("25.0", "450.0")
-    load_config(write(wide))
+    load_rig(write(wide))
     message = refusal(write(wide.replace("air: 1.0, window: 1.49, fluid: 1.33", "air: 1.5, window: 1.49, fluid: 1.1")))
     assert "media.fluid: is 1.1" in message
     assert "n sin = 1.12" in message
@@ -218,11 +218,11 @@ def test_hostile_text_is_refused_quickly(tmp_path: Path, content: bytes, words: 
 
 
 def test_what_a_lattice_alone_and_numbers_of_yaml_1_2_mean(write) -> None:
-    config = load_config(write(RIG.replace("0.8,", "8e-1,").replace("177", "0xB1")))
+    config = load_rig(write(RIG.replace("0.8,", "8e-1,").replace("177", "0xB1")))
     assert config.camera_model().microlens_focal_length_mm == 0.8
     assert config.image_shape() == (177, 235)
     # A lattice alone needs no main lens.
-    config = load_config(write("camera: {microlenses: {pitch_mm: 0.1}, sensor: {pixel_um: 5, columns: 9, rows: 7}}\n"))
+    config = load_rig(write("camera: {microlenses: {pitch_mm: 0.1}, sensor: {pixel_um: 5, columns: 9, rows: 7}}\n"))
     assert config.image_shape() == (7, 9)
     with pytest.raises(ConfigError, match="camera.main_lens: is missing"):
         config.camera_model()
@@ -241,51 +241,51 @@ def test_what_a_lattice_alone_and_numbers_of_yaml_1_2_mean(write) -> None:
     ],
 )
 def test_what_a_command_needs_and_the_file_lacks_is_named(write, section: str, ask) -> None:
-    config = load_config(write("weights: {}\n"))
+    config = load_rig(write("weights: {}\n"))
     with pytest.raises(ConfigError, match=f"rig.yaml: {section}: is missing"):
         ask(config)
 
 
 def test_lengths_follow_from_f_numbers_pupils_and_the_image_distance(write, table2: Camera) -> None:
     text = RIG.replace("focal_length_mm: 100.0, aperture_mm: 25.0", "image_distance_mm: 200, f_number: 4")
-    camera = load_config(write(text.replace("{focal_length_mm: 0.8", "{f_number: 8"))).camera_model()
+    camera = load_rig(write(text.replace("{focal_length_mm: 0.8", "{f_number: 8"))).camera_model()
     assert (camera.focal_length_mm, camera.aperture_mm) == (100.0, 25.0)
     assert camera.microlens_distance_mm == camera.microlens_focal_length_mm == pytest.approx(0.8)
     # With P = 1.25 the array lies 100 (1.25 + 1) mm behind the exit pupil, the focus 180 mm before the entrance.
     for told in ("focal_length_mm: 100, pupil_ratio: 1.25", "image_distance_mm: 225, pupil_ratio: 1.25"):
-        camera = load_config(write(RIG.replace("focal_length_mm: 100.0", told))).camera_model()
+        camera = load_rig(write(RIG.replace("focal_length_mm: 100.0", told))).camera_model()
         assert camera.focus_distance_mm == pytest.approx(180.0)
         assert camera.micro_image_lattice_px().pitch * 5.5 == pytest.approx(100.0 * (1.0 + 0.8 / 225.0))
         assert camera.aperture_mm == 25.0
     telecentric = RIG.replace("focal_length_mm: 100.0", "focal_length_mm: 100, image_distance: infinite")
-    camera = load_config(write(telecentric)).camera_model()
+    camera = load_rig(write(telecentric)).camera_model()
     assert camera.focus_distance_mm == pytest.approx(100.0)
     assert camera.micro_image_lattice_px().pitch * 5.5 == pytest.approx(100.0)
 
 
 def test_grid_is_centred_and_moved_and_voxels_chosen_by_the_program_fill_the_size(write) -> None:
-    grid = load_config(write(RIG.replace("voxel_mm: 0.1", "voxel_mm: [0.1, 0.2, 0.3], centre_mm: [1, 2, 3]"))).grid(
+    grid = load_rig(write(RIG.replace("voxel_mm: 0.1", "voxel_mm: [0.1, 0.2, 0.3], centre_mm: [1, 2, 3]"))).grid(
         Reference("mid_plane", -0.5)
     )
     assert grid.spacing_mm == (0.1, 0.2, 0.3)
     middle = [np.mean(grid.bounds_mm(axis)) for axis in range(3)]
     assert middle == pytest.approx([1.0, 2.0, 2.5])
     text = RIG.replace("shape_xyz: [8, 6, 4], voxel_mm: 0.1", "size_mm: [1.3, 1.0, 1.03]")
-    grid = load_config(write(text)).grid()
+    grid = load_rig(write(text)).grid()
     assert np.multiply(grid.shape_xyz, grid.spacing_mm) == pytest.approx([1.3, 1.0, 1.03])
     assert grid.spacing_mm[0] == pytest.approx(0.1 / 3.0)
     assert 0.15 < grid.spacing_mm[2] < 0.25
 
 
 def test_windows_in_voxels_and_millimetres(write) -> None:
-    config = load_config(write("correlation: {window_mm: 1.6}\n"))
+    config = load_rig(write("correlation: {window_mm: 1.6}\n"))
     assert config.windows_voxel((0.1, 0.1, 0.2))[-1] == (16, 16, 8)
-    assert load_config(write("correlation: {windows: [32, [16, 16, 8]]}\n")).windows_voxel((1, 1, 1)) == (
+    assert load_rig(write("correlation: {windows: [32, [16, 16, 8]]}\n")).windows_voxel((1, 1, 1)) == (
         (32, 32, 32),
         (16, 16, 8),
     )
     # Cubes by default, as far as long voxels allow.
-    config = load_config(write("correlation: {dt_s: 0.001}\n"))
+    config = load_rig(write("correlation: {dt_s: 0.001}\n"))
     assert config.windows_voxel((0.1, 0.1, 0.1)) == ((32, 32, 32), (16, 16, 16))
     assert config.windows_voxel((0.1, 0.1, 0.15)) == ((32, 32, 22), (16, 16, 11))
     # as the program chooses voxels: 16 of them would be 8 mm deep
@@ -294,7 +294,7 @@ def test_windows_in_voxels_and_millimetres(write) -> None:
 
 @pytest.mark.parametrize("voxel_mm", np.linspace(0.04, 0.22, 37))
 def test_windows_in_millimetres_always_give_the_paper_s_number(write, voxel_mm: float) -> None:
-    config = load_config(write("correlation: {window_mm: 1.6}\n"))
+    config = load_rig(write("correlation: {window_mm: 1.6}\n"))
     voxel = (voxel_mm,) * 3
     shape = tuple(round(length / voxel_mm) for length in (10.0, 13.0, 10.0))
     layout = layout_windows(shape, config.windows_voxel(voxel)[-1], config.overlap(voxel))
@@ -309,7 +309,7 @@ def test_windows_in_millimetres_always_give_the_paper_s_number(write, voxel_mm: 
 
 def test_the_channels_wall_puts_the_focal_point_where_it_is(write) -> None:
     """The window implied by wall, channel and mid plane must give back the fluid path width/2 - mid_plane_z."""
-    config = load_config(write(RIG + "channel: {width_mm: 10.0, wall_mm: 5.0}\n"))
+    config = load_rig(write(RIG + "channel: {width_mm: 10.0, wall_mm: 5.0}\n"))
     window = config.window_model(mid_plane_z_mm=-0.4655)
     assert window.thickness_mm == 5.0
     path = fluid_path_to_focus(window, config.camera_model().focus_distance_mm, config.media_model())
@@ -318,15 +318,15 @@ def test_the_channels_wall_puts_the_focal_point_where_it_is(write) -> None:
 
 def test_walls_are_those_of_the_section_that_is_named(write) -> None:
     sections = "channel: {width_mm: 10, wall_mm: 2, no_slip: true}\npipe: {radius_mm: 5.0, centre_mm: [0, 0, 0.1]}\n"
-    config = load_config(write(RIG + sections))
+    config = load_rig(write(RIG + sections))
     assert config.masking_walls() is None
     assert config.still_walls() == ParallelWalls(10.0)
-    config = load_config(write(RIG + sections.replace("0.1]", "0.1], no_slip: true") + "correlation: {mask: pipe}\n"))
+    config = load_rig(write(RIG + sections.replace("0.1]", "0.1], no_slip: true") + "correlation: {mask: pipe}\n"))
     assert config.masking_walls() == config.still_walls() == RoundWall(5.0, (0.0, 0.0, 0.1), "x")
 
 
 def test_options_override_and_are_checked(write) -> None:
-    config = load_config(write("reconstruction: {solver: sart, iterations: 200}\ncorrelation: {window_mm: 1.6}\n"))
+    config = load_rig(write("reconstruction: {solver: sart, iterations: 200}\ncorrelation: {window_mm: 1.6}\n"))
     assert config.overridden("reconstruction", solver=None, iterations=5).reconstruction.iterations == 5
     options = ReconstructOptions(iterations=7, solver=None, mask=Path("mask.png"))
     assert config.overridden_by("reconstruction", options) == config.overridden("reconstruction", iterations=7)
@@ -338,7 +338,7 @@ def test_options_override_and_are_checked(write) -> None:
 
 def test_flow_centres_move_with_the_origin(write) -> None:
     text = "simulation: {flow: {kind: shear, rate_per_s: 1000, centre_mm: [0, 0, 0.5]}}\n"
-    config = load_config(write(text))
+    config = load_rig(write(text))
     points = np.array([[0.0, 0.0, 2.5]])
     assert config.true_flow()(points)[0] == pytest.approx([2.0, 0.0, 0.0])
     assert config.simulated_flow(Reference("mid_plane", 1.0))(points)[0] == pytest.approx([1.0, 0.0, 0.0])
@@ -350,17 +350,17 @@ def test_what_follows_from_other_sections_unless_given(write) -> None:
         ("reconstruction: {solver: sart}", 1.0),
         ("correlation: {exponent: 0.75}", 0.75),
     ):
-        assert load_config(write(RIG + sections)).correlation_settings((1.0, 1.0, 1.0)).exponent == exponent
+        assert load_rig(write(RIG + sections)).correlation_settings((1.0, 1.0, 1.0)).exponent == exponent
     for sections, methods in (
         ("", ("volumes", "particles")),
         ("weights: {method: dlfc}", ("volumes",)),
         ("reconstruction: {solver: particles}", ("particles",)),
         ("validation: {flow_methods: [particles]}", ("particles",)),
     ):
-        assert load_config(write(RIG + sections)).flow_methods() == methods
+        assert load_rig(write(RIG + sections)).flow_methods() == methods
     text = "reconstruction: {solver: particles}\nvalidation: {flow_methods: [volumes, particles]}\n"
     with pytest.raises(ConfigError, match="flow_methods: holds volumes"):
-        load_config(write(RIG + text)).flow_methods()
+        load_rig(write(RIG + text)).flow_methods()
 
 
 def changed(folder: Path, keys: str, value: Any, **others: Any) -> Path:

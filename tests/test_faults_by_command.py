@@ -17,7 +17,7 @@ import pytest
 
 from lfpiv_cli.errors import OutputError
 from lfpiv_cli.files import inputs
-from lfpiv_cli.files.config import load_config
+from lfpiv_cli.files.config import load_rig
 from lfpiv_cli.files.vtkhdf import open_vectors, write_vectors, write_volume
 from lfpiv_cli.flow.correlation import held_bytes
 from lfpiv_cli.flow.windows import CorrelationSettings
@@ -373,7 +373,7 @@ def test_a_volume_far_beyond_what_can_be_refocused_is_judged_at_its_end(monkeypa
         planning.planning, "in_miniature", lambda _camera, _media, depths_mm, *_: asked.append(depths_mm)
     )
     monkeypatch.setattr(planning.planning, "errors_by_depth_mm", lambda *_: np.ones((len(asked[0]), 3)))
-    settings = load_config(CONFIG).overridden("volume", reference="focal_point", shape_xyz=(4000, 4000, 4000))
+    settings = load_rig(CONFIG).overridden("volume", reference="focal_point", shape_xyz=(4000, 4000, 4000))
     bench = planning.bench_of(settings, None)
     assert bench.errors_mm.shape == (planning.DEPTHS, 3)
     far = planning.FARTHEST_FIELDS * depth_of_field_mm(bench.camera, bench.media)

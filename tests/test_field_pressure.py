@@ -13,7 +13,7 @@ from lfpiv_cli.fields.pressure import laplacian_at, pressure_field, pressure_gra
 from lfpiv_cli.fields.spline_field import spline_field
 from lfpiv_cli.fields.stencils import Lattice
 from lfpiv_cli.fields.structure import Samples
-from lfpiv_cli.files.config import load_config
+from lfpiv_cli.files.config import load_rig
 from lfpiv_cli.files.particle_file import Points
 from lfpiv_cli.grid import FOCAL_POINT
 from lfpiv_cli.synthetic.flows import taylor_green
@@ -216,7 +216,7 @@ def sequence_files(rng, step_mm=0.2, count=200):
 
 
 def water(**options):
-    settings = load_config(ROOT / "configs" / "table2.yaml")
+    settings = load_rig(ROOT / "configs" / "table2.yaml")
     return settings.overridden("media", **({"fluid_density_kg_m3": 998.2, "fluid_viscosity_pa_s": 1e-3} | options))
 
 
@@ -235,7 +235,7 @@ def test_rows_of_a_file_are_the_trajectories_again(rng):
 def test_density_and_viscosity_are_asked_for(rng):
     points, frames, _ = sequence_files(rng, count=30)
     with pytest.raises(ConfigError, match=r"media.fluid_density_kg_m3: is missing"):
-        pressure_of(points, frames, load_config(ROOT / "configs" / "table2.yaml"))
+        pressure_of(points, frames, load_rig(ROOT / "configs" / "table2.yaml"))
     with pytest.raises(UsageError, match="frame 7 is none of 7"):
         pressure_of(points, frames, water(), 7)
 

@@ -14,7 +14,7 @@ from click.testing import CliRunner, Result
 
 from lfpiv_cli.cli.main import cli
 from lfpiv_cli.errors import ConfigError, OutputExistsError, UsageError
-from lfpiv_cli.files.config import Config, load_config
+from lfpiv_cli.files.config import Config, load_rig
 from lfpiv_cli.files.rig_numbers import LATTICES, RigNumbers, rig_text, schema, tree_of
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.validation import planning
@@ -46,7 +46,7 @@ def typed(answers: str, *arguments: str) -> Result:
 def test_a_rig_of_few_numbers_has_no_contradictions_and_sees_its_volume(numbers: RigNumbers, tmp_path: Path) -> None:
     path = tmp_path / "rig.yaml"
     init(path, InitOptions(numbers=numbers))
-    settings = load_config(path)
+    settings = load_rig(path)
     assert settings.resolved() == Config.from_resolved(tree_of(numbers)).resolved()
     if numbers.channel_mm is None:
         assert plan_of(settings, None).notices == []
@@ -67,7 +67,7 @@ def test_windows_give_ten_vectors_along_each_axis_where_tracers_allow_it(
 ) -> None:
     path = tmp_path / "rig.yaml"
     init(path, InitOptions(numbers=numbers))
-    bench = bench_of(load_config(path), None)
+    bench = bench_of(load_rig(path), None)
     window, vectors = np.array(bench.settings.correlation.window_mm), np.array(bench.window_layout.count)
     tracers = bench.settings.simulation.particles * np.prod(window / bench.sides_mm)
     # Windows are written in three digits, and rounded down.
@@ -114,12 +114,12 @@ def test_answers_that_cannot_be_are_asked_again_and_a_magnification_is_negative(
     for answer, expected in (("-0.5", -0.5), ("0.5", -0.5), ("0\n2", -2.0)):
         done = typed(answer + 15 * "\n", str(path), "--overwrite")
         assert done.exit_code == 0, done.output
-        assert load_config(path).sections.camera.main_lens.magnification == expected
+        assert load_rig(path).sections.camera.main_lens.magnification == expected
     for answer in ("105 furlongs", "0 mm", "mm", "-5 cm", "1e400 m"):
         done = typed(f"\n{answer}\n10.5 cm\n" + 15 * "\n", str(path), "--overwrite")
         assert done.exit_code == 0, done.output
         assert "expected a number above 0" in done.stderr or "is no number" in done.stderr
-        assert load_config(path).sections.camera.main_lens.focal_length_mm == 105.0
+        assert load_rig(path).sections.camera.main_lens.focal_length_mm == 105.0
 
 
 # Magnification, focal length, pitch, microlenses, aperture, pixels, columns, rows, fluid, wall, its thickness, channel,
@@ -163,7 +163,7 @@ def test_nothing_is_asked_before_an_existing_file_is_refused(tmp_path: Path) -> 
 def test_cameras_are_those_of_the_configs(tmp_path: Path) -> None:
     def written(name: Any) -> tuple[Config, Config]:
         init(tmp_path / f"{name}.yaml", InitOptions(camera=name))
-        return load_config(tmp_path / f"{name}.yaml"), load_config(ROOT / "configs" / f"{name}.yaml")
+        return load_rig(tmp_path / f"{name}.yaml"), load_rig(ROOT / "configs" / f"{name}.yaml")
 
     for name in LATTICES:
         ours, shipped = written(name)
@@ -182,7 +182,7 @@ def test_what_a_calibration_was_made_with_is_written_again(tmp_path: Path) -> No
     made = tmp_path / "calibration.h5"
     calibrate_snapshot(sample, made, CalibrateOptions(white=[data / "white.tif"], dark=data / "dark.tif"))
     init(tmp_path / "rig.yaml", InitOptions(calibration=made))
-    assert load_config(tmp_path / "rig.yaml").resolved() == load_config(sample).resolved()
+    assert load_rig(tmp_path / "rig.yaml").resolved() == load_rig(sample).resolved()
 
 
 def test_one_source_is_needed_and_a_volume_that_the_sensor_sees(tmp_path: Path) -> None:

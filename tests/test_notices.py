@@ -27,7 +27,7 @@ from lfpiv_cli.console import Console
 from lfpiv_cli.errors import ConfigError, InputError
 from lfpiv_cli.files.batch import Target, pending
 from lfpiv_cli.files.calibration_file import open_calibration
-from lfpiv_cli.files.config import Config, load_config
+from lfpiv_cli.files.config import Config, load_rig
 from lfpiv_cli.files.hdf5 import write_tree
 from lfpiv_cli.files.images import write_tiff
 from lfpiv_cli.files.particle_file import Points
@@ -209,7 +209,7 @@ def test_image_distance_is_that_of_the_exit_pupil(table2: Camera) -> None:
 
 def rig_of(folder: Path, *changes: tuple[str, str]) -> Config:
     """Return the sample's rig, z from the focal point, with pieces of its text replaced."""
-    return load_config(sample_rig(folder, AT_FOCUS, *changes))
+    return load_rig(sample_rig(folder, AT_FOCUS, *changes))
 
 
 def test_faults_of_a_rig_that_are_refused(tmp_path: Path) -> None:
@@ -265,7 +265,7 @@ def test_microscope_objectives(na: float, told: list[str] | None, tmp_path: Path
     rig = OBJECTIVE.replace("APERTURE", f"{aperture:.4f}").replace("F_NUMBER", f"{210.0 / aperture:.4f}")
     (tmp_path / "rig.yaml").write_text(rig)
     with pytest.raises(ConfigError, match=r"NA 0\.80.* at most 1 may be") if told is None else nullcontext():
-        assert [each.code for each in plan_of(load_config(tmp_path / "rig.yaml"), None).notices] == told
+        assert [each.code for each in plan_of(load_rig(tmp_path / "rig.yaml"), None).notices] == told
 
 
 def test_refraction_error_is_the_papers_aberration_and_sine_error_that_of_two_rays(

@@ -16,7 +16,7 @@ from lfpiv_cli.calibration.light_checks import Shapes, field_depth, shape_notice
 from lfpiv_cli.calibration.model import Photographs, calibrate
 from lfpiv_cli.calibration.sheet import board_notices
 from lfpiv_cli.errors import ConfigError
-from lfpiv_cli.files.config import load_config
+from lfpiv_cli.files.config import load_rig
 from lfpiv_cli.optics.camera import Camera, Lattice, Objective, real_lens, refocused, thin_lens
 from lfpiv_cli.optics.media import Media, Window
 from lfpiv_cli.optics.tracing import ObjectSpace, disc_points, trace
@@ -190,7 +190,7 @@ def test_waves_are_refused_where_rays_alone_are_rendered(tmp_path: Path, strengt
     scene = f"simulation:\n  light: {{kind: waves}}\n  objective: {{{strength}}}\n"
     rig.write_text(SAMPLE.read_text().replace("simulation:\n", scene))
     with pytest.raises(ConfigError, match="simulation.objective: vignetting and array_tilt_deg"):
-        real_camera(load_config(rig))
+        real_camera(load_rig(rig))
 
 
 F_1, F_2 = 150.0, 150.0

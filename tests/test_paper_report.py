@@ -16,7 +16,7 @@ from click.testing import CliRunner
 from lfpiv_cli.cli.main import cli
 from lfpiv_cli.console import Console
 from lfpiv_cli.errors import InputError, LimitMissedError, OutputExistsError, UsageError
-from lfpiv_cli.files.config import load_config
+from lfpiv_cli.files.config import load_rig
 from lfpiv_cli.files.pages import Table, ensure_pages
 from lfpiv_cli.flow.field import REJECTED, VALID, VectorField
 from lfpiv_cli.grid import Grid
@@ -369,7 +369,7 @@ def test_every_way_is_a_config_of_the_same_experiment(size: tuple[int, int, int]
     settings = {}
     for name, rig in ways.items():
         (tmp_path / f"{name}.yaml").write_text(yaml.safe_dump(rig))
-        settings[name] = load_config(tmp_path / f"{name}.yaml")
+        settings[name] = load_rig(tmp_path / f"{name}.yaml")
     assert len({each.simulation for each in settings.values()}) == 1
     low, high = settings["dlfc"].grid().bounds_mm(2)
     assert low < min(board_depths(settings["dlfc"])) < max(board_depths(settings["dlfc"])) < high

@@ -10,7 +10,7 @@ from scipy.spatial import KDTree
 
 from lfpiv_cli.errors import InputError, OutputExistsError, PartialError, UsageError
 from lfpiv_cli.files import vtkhdf
-from lfpiv_cli.files.config import carried_config, load_config
+from lfpiv_cli.files.config import carried_config, load_rig
 from lfpiv_cli.files.images import read_image
 from lfpiv_cli.files.particle_file import (
     PARTICLES_FORMAT,
@@ -44,7 +44,7 @@ def write_frame(path: Path, position_mm: np.ndarray, **changes: object) -> None:
     n = len(position_mm)
     covariance = np.tile([1e-6, 1e-6, 1e-4, 0.0, 0.0, 0.0], (n, 1))
     arrays = {"intensity": np.ones(n), "covariance_mm2": covariance, "chi2": np.ones(n), "seen": np.ones(n)}
-    resolved = load_config(CONFIG).resolved() | changes
+    resolved = load_rig(CONFIG).resolved() | changes
     arrays["flag"] = np.zeros(n, np.uint8)
     points = Points(position_mm, arrays, Reference("mid_plane", 0.5), {}, {"config": resolved})
     write_points(path, PARTICLES_FORMAT, points, overwrite=True)
@@ -71,7 +71,7 @@ def test_track_writes_tracks_and_vectors(
     assert tracks.reference == Reference("mid_plane", 0.5)
     # What tracking chose stands beside the config's sections.
     assert tracks.provenance["config"]["search_mm"] > 0.0
-    assert carried_config(tracks.provenance, "tracks").resolved() == load_config(CONFIG).resolved()
+    assert carried_config(tracks.provenance, "tracks").resolved() == load_rig(CONFIG).resolved()
     field = vtkhdf.open_vectors(tmp_path / "tracks_grid.vtkhdf")
     assert field.flag.shape == (6, 3, 5)
     assert np.abs(field.displacement_voxel[field.flag == 0] - (2.0, -1.0, 0.5)).max() < 1e-6
@@ -132,7 +132,7 @@ def test_nothing_to_track_is_an_error_and_no_tracks_are_said(
 
 
 def test_vectors_beyond_the_walls_are_masked(tmp_path: Path, rng: np.random.Generator) -> None:
-    resolved = load_config(CONFIG).resolved()
+    resolved = load_rig(CONFIG).resolved()
     changes = {"correlation": resolved["correlation"] | {"mask": "channel"}}
     changes |= {"channel": resolved["channel"] | {"width_mm": 2.0}}
     start, paths = rng.uniform(LOW, HIGH, (300, 3)), (tmp_path / "a.vtkhdf", tmp_path / "b.vtkhdf")
@@ -226,7 +226,7 @@ def test_the_sample_from_images_to_vectors(tmp_path: Path) -> None:
 
     field = vtkhdf.open_vectors(tmp_path / "tracks_grid.vtkhdf")
     z, y, x = np.meshgrid(*(field.grid.axis_mm(axis) for axis in (2, 1, 0)), indexing="ij")
-    true = load_config(CONFIG).true_flow()(np.stack([x, y, z], axis=-1).reshape(-1, 3)).reshape(*x.shape, 3)
+    true = load_rig(CONFIG).true_flow()(np.stack([x, y, z], axis=-1).reshape(-1, 3)).reshape(*x.shape, 3)
     error = field.displacement_voxel - true * 0.002 * 1e4
     rms = np.sqrt(np.mean(error**2, axis=(0, 1, 2)))
     # Measured 0.002, 0.001 and 0.04 voxel; correlation of volumes makes 0.1 and, in depth, one.
@@ -245,7 +245,7 @@ def test_velocities_of_a_sequence_are_better_than_those_of_a_pair(tmp_path: Path
     places = [tmp_path / "particles" / f"{shot.stem}.vtkhdf" for shot in shots]
     run("track", *places[1:3], "-o", tmp_path / "pair.vtkhdf", "--grid")
     run("track", *places, "-o", tmp_path / "tracks.vtkhdf", "--grid")
-    flow = load_config(rig).true_flow()
+    flow = load_rig(rig).true_flow()
 
     def spread(position: np.ndarray, velocity: np.ndarray) -> np.ndarray:
         inside = np.all(np.abs(position) < (1.5, 1.1, 2.0), axis=1)

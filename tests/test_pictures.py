@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from lfpiv_cli.files.config import load_config
+from lfpiv_cli.files.config import load_rig
 from lfpiv_cli.files.vtkhdf import write_vectors
 from lfpiv_cli.flow.field import MASKED, REJECTED, VALID, VectorField
 from lfpiv_cli.grid import Grid, Reference
@@ -313,7 +313,7 @@ def test_figures_of_a_file_follow_what_it_knows(field: NDArray[np.float64], tmp_
     np.testing.assert_array_equal(image_of(panels(drawn)[0]), varied.correlation[2])
     assert len(figures["displacements"].draw().axes) == 6
     # With the camera known, what displacements are beyond whole microlenses (0.1 mm) is shown, too.
-    write_vectors(path, varied, AT_FOCUS, provenance={"config": load_config(SAMPLE).resolved()}, overwrite=True)
+    write_vectors(path, varied, AT_FOCUS, provenance={"config": load_rig(SAMPLE).resolved()}, overwrite=True)
     below = figures_of(path)["displacements"].draw().axes[-3:]
     assert [axes.get_xlabel() for axes in below] == [f"{name} beyond whole microlenses (microlenses)" for name in "uvw"]
     parts = field.displacement_voxel[field.flag == VALID][:, 0]

@@ -12,7 +12,7 @@ from scipy.spatial import KDTree
 
 from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.files.calibration_file import open_calibration, write_calibration
-from lfpiv_cli.files.config import load_config
+from lfpiv_cli.files.config import load_rig
 from lfpiv_cli.files.hdf5 import open_h5, read_provenance
 from lfpiv_cli.files.particle_file import open_particles
 from lfpiv_cli.files.particles import read_particles
@@ -137,7 +137,7 @@ def test_a_pipe_that_is_not_where_it_was_said_is_found_and_measured(
     by_wall, sigma = np.array(figures["axis_by_wall_shift_mm"]), np.array(figures["axis_by_wall_shift_mm_sigma"])
     assert np.all(np.abs(by_wall - (-0.1, 0.15)) < 3.0 * sigma)
     assert (tmp_path / "walls.png").stat().st_size > 10_000
-    pipe = load_config(tmp_path / "told.yaml").with_scene_of(open_calibration(refined)).pipe
+    pipe = load_rig(tmp_path / "told.yaml").with_scene_of(open_calibration(refined)).pipe
     assert pipe is not None
     np.testing.assert_allclose(pipe.centre_mm[1:], (-0.1, 0.15), atol=0.01)
 

@@ -12,7 +12,7 @@ from click.testing import CliRunner
 from lfpiv_cli.cli.main import cli
 from lfpiv_cli.console import Console
 from lfpiv_cli.errors import InputError, OutputExistsError, UsageError
-from lfpiv_cli.files.config import load_config
+from lfpiv_cli.files.config import load_rig
 from lfpiv_cli.files.hdf5 import write_tree
 from lfpiv_cli.files.images import write_tiff
 from lfpiv_cli.files.particle_file import (
@@ -283,7 +283,7 @@ def test_wrong_names_outputs_and_images_are_refused_before_drawing(volume, tmp_p
 
 def test_particles_bring_their_residual_and_weights_their_middle_voxel(config, tmp_path):
     path, raw = tmp_path / "a.vtkhdf", tmp_path / "raw.tif"
-    made = {"command": "reconstruct", "config": load_config(config).resolved()}
+    made = {"command": "reconstruct", "config": load_rig(config).resolved()}
     write_points(path, PARTICLES_FORMAT, points(np.random.default_rng(1), PARTICLES_FORMAT, made), overwrite=True)
     assert list(figures_of(path)) == ["places", "depths", "chi2"]
     write_tiff(tmp_path / "a_residual.tif", np.ones((200, 240), np.float32), overwrite=True)

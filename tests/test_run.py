@@ -333,7 +333,7 @@ def test_what_cannot_be_is_said_before_anything_is_made(
 def test_the_method_is_what_errs_less(
     count: float | None, method: Any, methods: tuple[str, ...], said: str, tmp_path: Path
 ) -> None:
-    settings = stage.load_config(rig_in(tmp_path))
+    settings = stage.load_rig(rig_in(tmp_path))
     choice = stage._chosen(settings, RunOptions(images=PAIR, method=method), lambda: count)
     assert choice.methods == methods
     assert said in choice.reason

@@ -14,7 +14,7 @@ from lfpiv_cli.calibration import model
 from lfpiv_cli.console import CONSOLE
 from lfpiv_cli.errors import ConfigError, InputError
 from lfpiv_cli.files.calibration_file import open_calibration, write_calibration
-from lfpiv_cli.files.config import Config, load_config
+from lfpiv_cli.files.config import Config, load_rig
 from lfpiv_cli.files.sections import FaceSection
 from lfpiv_cli.files.yaml_nodes import read_heights
 from lfpiv_cli.grid import Grid
@@ -55,7 +55,7 @@ def configured(tmp_path: Path) -> Callable[[str], Config]:
     def config_of(text: str) -> Config:
         path = tmp_path / "rig.yaml"
         path.write_text(text)
-        return load_config(path)
+        return load_rig(path)
 
     return config_of
 

@@ -13,7 +13,7 @@ from scipy.ndimage import gaussian_filter
 
 from benchmarks.volumes import Seeding, volume_pair
 from lfpiv_cli.errors import InputError, PartialError, UsageError
-from lfpiv_cli.files.config import load_config
+from lfpiv_cli.files.config import load_rig
 from lfpiv_cli.files.provenance import record
 from lfpiv_cli.files.vtkhdf import open_vectors, read_header, write_volume
 from lfpiv_cli.flow.correlation import correlate
@@ -49,7 +49,7 @@ def moved(
     arrays = volume_pair(lambda at: np.tile(SHIFT, (len(at), 1)), shape, seeding, np.random.default_rng(5 + number))
     grid, paths = Grid.centred(shape, spacing, (0.0, 0.0, 0.0)), [folder / f"{name}{number}.vtkhdf" for name in "ab"]
     for k, (path, array) in enumerate(zip(paths, arrays, strict=True)):
-        made_by = record("test", load_config(CONFIG).resolved(), {})
+        made_by = record("test", load_rig(CONFIG).resolved(), {})
         if times_s:
             made_by["inputs"] = {"image": {"name": "run.cine", "sha256": "x", "time_s": times_s[k]}}
         write_volume(path, array, grid, REFERENCE, provenance=made_by, attributes={}, overwrite=False)

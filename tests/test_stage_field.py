@@ -13,7 +13,7 @@ from lfpiv_cli.console import Console
 from lfpiv_cli.errors import InputError, UsageError
 from lfpiv_cli.fields.structure import Samples
 from lfpiv_cli.files import vtkhdf
-from lfpiv_cli.files.config import Config, load_config
+from lfpiv_cli.files.config import Config, load_rig
 from lfpiv_cli.files.particle_file import TRACKS_FORMAT, Points, open_tracks, write_points
 from lfpiv_cli.flow.correlation import SMALLEST_VALID_FRACTION
 from lfpiv_cli.flow.field import MASKED
@@ -47,7 +47,7 @@ def write_tracks(
     arrays |= dict.fromkeys(("particle_a", "particle_b"), np.arange(count))
     if full:
         arrays["displacement_covariance_mm2"] = np.tile([*sigma**2, 0.0, 0.0, 0.0], (count, 1))
-    settings = load_config(CONFIG).overridden("correlation", dt_s=dt_s)
+    settings = load_rig(CONFIG).overridden("correlation", dt_s=dt_s)
     for section, keys in (changes or {}).items():
         settings = settings.overridden(section, **keys)
     attributes, made = {"dt_s": settings.correlation.dt_s}, {"config": settings.resolved()}
@@ -105,7 +105,7 @@ def test_field_has_the_flow_of_its_tracks(tmp_path: Path, fitted_by: Callable[..
 
 @pytest.mark.thorough
 def test_walls_stand_still_by_command(tmp_path: Path, fitted_by: Callable[..., dict[str, Any]]) -> None:
-    wall, at = 0.5 * load_config(CONFIG).resolved()["channel"]["width_mm"], tmp_path / "at.csv"
+    wall, at = 0.5 * load_rig(CONFIG).resolved()["channel"]["width_mm"], tmp_path / "at.csv"
     np.savetxt(at, [[0.0, 0.0, -wall], [0.3, 0.2, wall], [0.0, 0.0, 0.0]], delimiter=",")
     still = {"flow": lambda place: -((place[:, 2:] / wall) ** 2) * MOVED_MM, "changes": {"channel": {"no_slip": True}}}
     assert fitted_by("--at", at, **still)["method"] == "splines"

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from lfpiv_cli.errors import ConfigError, InputError
-from lfpiv_cli.files.config import load_config
+from lfpiv_cli.files.config import load_rig
 from lfpiv_cli.files.images import read_image
 from lfpiv_cli.files.particles import Particles, read_particles, write_particles
 from tests.commands import CONFIG, run, sample_rig
@@ -147,7 +147,7 @@ def test_a_pipe_is_seeded_and_seen_through_its_walls(tmp_path: Path, name: str, 
     image = read_image(tmp_path / "out" / "pair_a.tif").astype(float)
     assert image.max() > 1000.0
     across = 1 if name == "pipe" else 0
-    camera = load_config(tmp_path / "rig.yaml").camera_model()
+    camera = load_rig(tmp_path / "rig.yaml").camera_model()
     pixels = np.flatnonzero((image > 1000.0).any(axis=1 - across))
     reach_mm = 0.5 * (pixels.max() - pixels.min()) * camera.pixel_mm
     half_mm = 0.5 * image.shape[across] * camera.pixel_mm
@@ -221,4 +221,4 @@ def test_light_of_waves_shows_the_same_scene(tmp_path: Path) -> None:
 )
 def test_light_that_cannot_be_is_refused(tmp_path: Path, light: str, match: str) -> None:
     with pytest.raises(ConfigError, match=match):
-        load_config(sample_rig(tmp_path, ("simulation:\n", f"simulation:\n  light: {light}\n")))
+        load_rig(sample_rig(tmp_path, ("simulation:\n", f"simulation:\n  light: {light}\n")))

@@ -10,7 +10,7 @@ import yaml
 
 from lfpiv_cli.console import Console
 from lfpiv_cli.errors import ConfigError, LimitMissedError, OutputExistsError, UsageError
-from lfpiv_cli.files.config import load_config
+from lfpiv_cli.files.config import load_rig
 from lfpiv_cli.files.particles import Particles, write_particles
 from lfpiv_cli.files.vtkhdf import write_vectors
 from lfpiv_cli.flow.field import VectorField
@@ -71,7 +71,7 @@ def test_light_that_is_fitted_otherwise_is_said_and_truths_that_are_none(tmp_pat
     cases = [(rays, None), (waves, 532.0), (rays, 532.0), (waves, None), (waves, 633.0)]
     found = []
     for light, wavelength_nm in cases:
-        settings = load_config(CONFIG).overridden("simulation", light=light)
+        settings = load_rig(CONFIG).overridden("simulation", light=light)
         notices = light_notices(settings.overridden("reconstruction", wavelength_nm=wavelength_nm))
         found.append([notice.code for notice in notices])
     assert found == [[], []] + 3 * [["light-differs"]]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from lfpiv_cli.arrays import Floats
-from lfpiv_cli.files.config import load_config
+from lfpiv_cli.files.config import load_rig
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.camera import Camera, Lattice
 from lfpiv_cli.optics.line_responses import USUAL_DIFFUSION_PX
@@ -176,7 +176,7 @@ def test_a_view_of_other_balls_is_that_made_for_them(table2: Camera, water: Medi
     ],
 )
 def test_notices_of_the_diameter(given: float | None, size: TracerSize, codes: list[str]) -> None:
-    settings = load_config(ROOT / "configs" / "table2.yaml").overridden("reconstruction", particle_diameter_mm=given)
+    settings = load_rig(ROOT / "configs" / "table2.yaml").overridden("reconstruction", particle_diameter_mm=given)
     assert [notice.code for notice in size_notices(settings, size)] == codes
 
 
@@ -198,7 +198,7 @@ def test_a_size_that_grows_beyond_all_tracers_is_none(monkeypatch: pytest.Monkey
 
 
 def test_images_that_contradict_each_other_are_told() -> None:
-    settings = load_config(ROOT / "configs" / "table2.yaml")
+    settings = load_rig(ROOT / "configs" / "table2.yaml")
     frames = [TracerSize(0.05, mm, 0.002, True, Diffusion(0.3, px, 0.02)) for mm, px in ((0.05, 0.3), (0.058, 0.5))]
     for alike in (frames[:1], [frames[0]] * 2):
         size = TracerSize(0.05, 0.05, 0.002, True, frames=tuple(alike))
@@ -330,6 +330,6 @@ def test_files_state_diffusion_and_its_error_where_it_is_not_given() -> None:
     ],
 )
 def test_notices_of_diffusion(diffusion: Diffusion, codes: list[str]) -> None:
-    settings = load_config(ROOT / "configs" / "table2.yaml")
+    settings = load_rig(ROOT / "configs" / "table2.yaml")
     size = TracerSize(0.05, 0.05, 0.002, True, diffusion)
     assert [notice.code for notice in size_notices(settings, size)] == codes

@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import NDArray
 
 from lfpiv_cli.errors import ConfigError, InputError
-from lfpiv_cli.files.config import Config, load_config
+from lfpiv_cli.files.config import Config, load_rig
 from lfpiv_cli.optics.camera import Camera, Lattice
 from lfpiv_cli.optics.curved_space import CurvedSpace, Face
 from lfpiv_cli.optics.shapes import HeightMap, RigidMotion
@@ -108,7 +108,7 @@ SIGMA_MM = np.array([1e-3, 2e-3, 0.012])
 
 @pytest.fixture(scope="module")
 def config() -> Config:
-    return load_config(CONFIG)
+    return load_rig(CONFIG)
 
 
 @pytest.fixture(scope="module")

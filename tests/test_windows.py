@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from benchmarks.volumes import Seeding, volume_pair
 from lfpiv_cli.errors import ConfigError, InputError
-from lfpiv_cli.files.config import load_config
+from lfpiv_cli.files.config import load_rig
 from lfpiv_cli.flow.correlation import Coarse, correlate, plan
 from lfpiv_cli.flow.deformation import MOST_TAPS, NEIGHBOURS, gather_taps, interpolate
 from lfpiv_cli.flow.field import MASKED, REJECTED, REPLACED, SECOND_PEAK, VALID, VectorField, statistics_of
@@ -116,7 +116,7 @@ def test_the_registry_has_the_names_that_config_and_option_choose() -> None:
     assert tuple(WEIGHTINGS) == names_in(Weighting)
     with pytest.raises(ConfigError, match="weighting of the windows is round"):
         CorrelationSettings([(8, 8, 8)], HALF, weighting="round").layout((16, 16, 16))
-    config, voxel_mm = load_config(TABLE2), (0.1, 0.1, 0.1)
+    config, voxel_mm = load_rig(TABLE2), (0.1, 0.1, 0.1)
     assert config.correlation_settings(voxel_mm).weighting == "uniform"
     chosen = config.overridden_by("correlation", CorrelateOptions(weighting="gaussian")).correlation_settings(voxel_mm)
     assert {step.layout.weighting for step in plan((100, 100, 100), chosen)} == {"gaussian"}

@@ -405,9 +405,6 @@ def load_rig(path: Path | str) -> Config:
     return Config(validated(read_rig(Path(path)), str(path)), str(path))
 
 
-load_config = load_rig
-
-
 def carried_config(record: Mapping[str, Any], source: Path | str) -> Config:
     """Return the resolved configuration in the record that one of our files carries.
 

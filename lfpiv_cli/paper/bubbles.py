@@ -12,7 +12,7 @@ import numpy as np
 
 from lfpiv_cli.arrays import Flags, Singles
 from lfpiv_cli.console import Console
-from lfpiv_cli.files.config import load_config
+from lfpiv_cli.files.config import load_rig
 from lfpiv_cli.files.images import read_image, write_tiff
 from lfpiv_cli.files.pages import Table
 from lfpiv_cli.paper.parts import Drawing, Findings, Row, Work
@@ -133,7 +133,7 @@ def _simulated(clean: Path, with_bubbles: Path, work: Work) -> dict[str, Any]:
     pictures = CalibrateOptions(white=[still / "white.tif"], dark=still / "dark.tif", board=[still / "board.tif"])
     calibrate_snapshot(clean, calibration, pictures, **common)
     build_weights_file(clean, work.folder / "weights.h5", BuildWeightsOptions(calibration=calibration), **common)
-    pitch_px = float(load_config(clean).camera_model().micro_image_lattice_px().pitch.max())
+    pitch_px = float(load_rig(clean).camera_model().micro_image_lattice_px().pitch.max())
     left_out = still_light(_pair(work), pitch_px)
     write_tiff(work.folder / MASK, np.where(left_out, 0, 255).astype(np.uint8), overwrite=True)
     return {"pixels_left_out": int(left_out.sum())}
@@ -159,7 +159,7 @@ def _measured(name: str, case: Case, work: Work) -> dict[str, Any]:
 
 def _read(work: Work, name: str) -> Measured:
     """Return vectors with the true flow."""
-    return measured_of(work.folder / f"{name}.vtkhdf", load_config(work.folder / "clean.yaml"), None, is_simulated=True)
+    return measured_of(work.folder / f"{name}.vtkhdf", load_rig(work.folder / "clean.yaml"), None, is_simulated=True)
 
 
 def _rows(found: Mapping[str, Mapping[str, Any]]) -> tuple[Row, ...]:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lfpiv_cli.console import Console
-from lfpiv_cli.files.config import load_config
+from lfpiv_cli.files.config import load_rig
 from lfpiv_cli.files.pages import Table
 from lfpiv_cli.notice import written
 from lfpiv_cli.paper.parts import BOARD, MISALIGNED, Drawing, Findings, Row, Work, sections
@@ -41,7 +41,7 @@ COMPARED = {
 def table1(work: Work) -> Findings:
     """Compare the columns of the paper's voxels, and of random ones, made in different ways."""
     config = work.config("table1", sections(validation={"weights": {"seed": SEED, "long_count_rays": 100_000_000}}))
-    settings = load_config(config)
+    settings = load_rig(config)
     camera, grid, rng = settings.camera_model(), settings.grid(), np.random.default_rng(SEED)
     space = replace(settings.plane_space("comparing ways to make weights"), window=settings.window_model())
     paper = np.array(weights.TABLE1_MM)[: work.by_size(1, 5, 5)]
@@ -150,7 +150,7 @@ LARGEST_DEVIATION = 1e-9
 
 def table2(work: Work) -> Findings:
     """Return the camera's derived quantities beside the paper's."""
-    settings = load_config(work.config("table2", sections()))
+    settings = load_rig(work.config("table2", sections()))
     camera, scale = settings.camera_model(), settings.camera_model().scale(settings.media_model())
     pitch = float(camera.lattice.pitch.mean())
     f_numbers = camera.focal_length_mm / camera.aperture_mm, camera.microlens_focal_length_mm / pitch

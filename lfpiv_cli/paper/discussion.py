@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from lfpiv_cli.arrays import Floats
-from lfpiv_cli.files.config import load_config
+from lfpiv_cli.files.config import load_rig
 from lfpiv_cli.files.pages import Table
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.camera import Camera
@@ -152,7 +152,7 @@ SIDE_PX, CROWD_SIDE_PX = 500, 260
 def discussion(work: Work) -> Findings:
     """Compare how long reconstructed tracers are with what the views' geometry and the light allow."""
     config = work.config("camera", sections(camera={"sensor": {"columns": SIDE_PX, "rows": SIDE_PX}}))
-    settings = load_config(config)
+    settings = load_rig(config)
     camera, media = settings.camera_model(), settings.media_model()
     reported = work.step("depth", partial(_by_depth, work, camera, media))
     crowd = work.step("seeding", partial(_by_seeding, work, camera, media))

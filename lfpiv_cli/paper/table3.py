@@ -16,7 +16,7 @@ import numpy as np
 
 from lfpiv_cli.arrays import Floats
 from lfpiv_cli.calibration.board_pose import BoardGeometry
-from lfpiv_cli.files.config import Config, load_config
+from lfpiv_cli.files.config import Config, load_rig
 from lfpiv_cli.files.pages import Table
 from lfpiv_cli.notice import written
 from lfpiv_cli.paper.parts import AS_PAPER, BOARD, Drawing, Findings, Row, Work, merged, sections
@@ -150,7 +150,7 @@ class _Boards:
 def _boards(work: Work, half: Half) -> _Boards:
     reach = REACH_MM[work.size]
     depths = tuple(depth for depth in of_boards.DEPTHS_MM if abs(depth) <= reach)
-    return _Boards(half, depths, load_config(_config(work, half, "paper")), load_config(_config(work, half, "best")))
+    return _Boards(half, depths, load_rig(_config(work, half, "paper")), load_rig(_config(work, half, "best")))
 
 
 def _config(work: Work, half: Half, name: str) -> Path:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from lfpiv_cli.console import Console
-from lfpiv_cli.files.config import load_config
+from lfpiv_cli.files.config import load_rig
 from lfpiv_cli.files.pages import Table
 from lfpiv_cli.paper.parts import AS_PAPER, BOARD, MISALIGNED, Drawing, Findings, Row, Work, merged, sections
 from lfpiv_cli.paper.pictures import cumulative_figure, slice_maps_figure
@@ -196,7 +196,7 @@ def _ways(size: ChannelSize) -> dict[str, dict[str, Any]]:
 
 def simulated_duct(config: Path) -> Duct:
     """Return the duct of a config that has `channel_sections`."""
-    duct = duct_of(load_config(config).simulation.flow)
+    duct = duct_of(load_rig(config).simulation.flow)
     assert duct is not None
     return duct
 
@@ -205,7 +205,7 @@ def _simulated(configs: Mapping[str, Path], images: Path, console: Console) -> d
     """Simulate the images that all are measured from: those of the flow once, and the boards of both calibrations."""
     simulate_images(configs["ert"], images, overwrite=True, console=console)
     if "dlfc" in configs:
-        settings = load_config(configs["dlfc"])
+        settings = load_rig(configs["dlfc"])
         simulate_boards(configs["dlfc"], images, board_depths(settings), overwrite=True, console=console)
     return {"folder": images.name}
 
@@ -220,7 +220,7 @@ def _measured(config: Path, images: Path, folder: Path, console: Console) -> dic
 
 def _read(config: Path, folder: Path) -> Measured:
     """Return the vectors in a folder with the true flow."""
-    settings = load_config(config)
+    settings = load_rig(config)
     name = "vectors" if settings.flow_methods() == ("volumes",) else "tracks_grid"
     return measured_of(folder / f"{name}.vtkhdf", settings, None, is_simulated=True)
 

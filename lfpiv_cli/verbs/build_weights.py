@@ -16,7 +16,7 @@ from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.files.atomic import ensure_writable
 from lfpiv_cli.files.batch import Target, is_kept
 from lfpiv_cli.files.calibration_file import open_calibration
-from lfpiv_cli.files.config import Config, load_config
+from lfpiv_cli.files.config import Config, load_rig
 from lfpiv_cli.files.inputs import given
 from lfpiv_cli.files.provenance import record, with_warnings
 from lfpiv_cli.files.weights_file import WeightsFile, open_weights, write_weights
@@ -306,7 +306,7 @@ def build_weights_file(
     inputs = given(config=config, calibration=options.calibration)
     ensure_writable(output, overwrite or options.resume, inputs.values())
     found = open_calibration(options.calibration) if options.calibration else None
-    settings = load_config(config).overridden_by("weights", options).with_scene_of(found)
+    settings = load_rig(config).overridden_by("weights", options).with_scene_of(found)
     if not options.dry_run:
         weights_cost.ensure_volume_fits(settings, by_volumes=False)
     plan = plan_of(settings, found)
@@ -337,6 +337,6 @@ def build_weights_file(
 
 def target_of(config: Path, output: Path, options: BuildWeightsOptions) -> Target:
     """Return where weights go, with the record that they will carry by a calibration that knows of no scene's place."""
-    resolved = load_config(config).overridden_by("weights", options).resolved()
+    resolved = load_rig(config).overridden_by("weights", options).resolved()
     inputs = given(config=config, calibration=options.calibration)
     return Target(output, partial(record, "build-weights", resolved, inputs))

@@ -21,7 +21,7 @@ from lfpiv_cli.files import images as image_files
 from lfpiv_cli.files.atomic import ensure_apart, ensure_writable
 from lfpiv_cli.files.batch import Target, is_kept
 from lfpiv_cli.files.calibration_file import open_calibration, write_calibration
-from lfpiv_cli.files.config import Config, load_config
+from lfpiv_cli.files.config import Config, load_rig
 from lfpiv_cli.files.inputs import given
 from lfpiv_cli.files.pages import ensure_drawing, write_picture
 from lfpiv_cli.files.provenance import record as provenance_record
@@ -227,7 +227,7 @@ def calibrate_snapshot(
         ensure_writable(target, overwrite or options.resume)
     if drawings:
         ensure_drawing()
-    settings = load_config(config)
+    settings = load_rig(config)
     shape = settings.image_shape()
     # Before the record, for which whole files are read: what is no image is so at once.
     frames = {name: image_files.read_reference(path, shape) for name, path in inputs.items() if name != "config"}
@@ -262,7 +262,7 @@ def calibrate_snapshot(
 
 def target_of(config: Path, output: Path, options: CalibrateOptions) -> Target:
     """Return where a calibration goes, with the record that it will carry."""
-    resolved = load_config(config).resolved()
+    resolved = load_rig(config).resolved()
     return Target(output, partial(provenance_record, "calibrate-snapshot", resolved, _inputs(config, options)))
 
 

@@ -17,7 +17,7 @@ from lfpiv_cli.console import CONSOLE, Console
 from lfpiv_cli.errors import ConfigError, InputError
 from lfpiv_cli.files.atomic import ensure_writable
 from lfpiv_cli.files.calibration_file import open_calibration
-from lfpiv_cli.files.config import Config, load_config
+from lfpiv_cli.files.config import Config, load_rig
 from lfpiv_cli.files.images import read_reference, read_single
 from lfpiv_cli.files.inputs import given
 from lfpiv_cli.files.pages import ensure_drawing, write_picture
@@ -336,7 +336,7 @@ def check(
     if options.picture is not None:
         ensure_writable(options.picture, overwrite, [*inputs.values(), *images])
         ensure_drawing()
-    settings = load_config(config)
+    settings = load_rig(config)
     shape = settings.image_shape()
     pictures = Pictures(
         {path.name: read_single(path, shape) for path in images},

@@ -18,7 +18,7 @@ from lfpiv_cli.errors import InputError, LfpivError, UsageError
 from lfpiv_cli.files import provenance, vtkhdf
 from lfpiv_cli.files.atomic import ensure_writable, folder_of
 from lfpiv_cli.files.batch import Target, output_paths
-from lfpiv_cli.files.config import Config, carried_config, load_config
+from lfpiv_cli.files.config import Config, carried_config, load_rig
 from lfpiv_cli.files.hdf5 import ensure_opens, fault_of
 from lfpiv_cli.files.inputs import ensure_room, given
 from lfpiv_cli.files.pairing import Pairs
@@ -246,7 +246,7 @@ class Correlation(PairBatch[Outcome, CorrelateOptions]):
             )
         self._groups = [self._pairs] if options.ensemble else [[pair] for pair in self._pairs]
         self._common = given(config=options.config, mask=options.mask_volume)
-        self._config = load_config(options.config) if options.config else None
+        self._config = load_rig(options.config) if options.config else None
         self.inputs = [*files, *self._common.values()]
         paths = output_paths(output, [group[0][0].stem for group in self._groups])
         self.targets = [Target(path, partial(self._record, number)) for number, path in enumerate(paths)]

@@ -16,7 +16,7 @@ from lfpiv_cli.files import images as image_files
 from lfpiv_cli.files.atomic import ensure_apart, ensure_writable
 from lfpiv_cli.files.batch import frames_of
 from lfpiv_cli.files.calibration_file import open_calibration, write_calibration
-from lfpiv_cli.files.config import Config, load_config
+from lfpiv_cli.files.config import Config, load_rig
 from lfpiv_cli.files.inputs import given
 from lfpiv_cli.files.pages import ensure_drawing, write_picture
 from lfpiv_cli.files.provenance import record
@@ -70,7 +70,7 @@ def refine_calibration(
     if picture:
         ensure_drawing()
     before = open_calibration(calibration)
-    reported = load_config(config)
+    reported = load_rig(config)
     settings = reported.with_scene_of(before)
     scene = settings.scene_space()
     if settings.channel is None and scene is None:

@@ -27,7 +27,7 @@ from lfpiv_cli.files import images as image_files
 from lfpiv_cli.files.atomic import ensure_writable, write_text
 from lfpiv_cli.files.batch import Frame, frames_of, output_paths, pending
 from lfpiv_cli.files.calibration_file import open_calibration
-from lfpiv_cli.files.config import Config, load_config
+from lfpiv_cli.files.config import Config, load_rig
 from lfpiv_cli.files.inputs import ensure_regular_file, split_part
 from lfpiv_cli.files.pages import ensure_drawing, ensure_pages
 from lfpiv_cli.files.pairing import Pairs
@@ -90,7 +90,7 @@ def run(
     ------
     PartialError : frames or pairs failed, and the others were worked on
     """
-    settings = load_config(config)
+    settings = load_rig(config)
     frames, pairs = _ensure_possible(settings, options)
     console.warn(pairs.settled(options.keep_going))
     steps = Steps(output, console, earlier_run(output, overwrite), options.deadline(), options.shard == ALL)
@@ -448,7 +448,7 @@ def warm_up(*, console: Console = CONSOLE) -> dict[str, Any]:
         for simulate in (simulate_white, simulate_board, simulate_particles):
             simulate(config, folder, console=quiet)
         advance(1)
-        images = [folder / frame for frame in frame_names(load_config(config).simulation.frames)]
+        images = [folder / frame for frame in frame_names(load_rig(config).simulation.frames)]
         recording = RunOptions(
             images=images[:2],
             white=(folder / "white.tif",),

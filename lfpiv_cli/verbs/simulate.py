@@ -21,7 +21,7 @@ from lfpiv_cli.calibration.model import mid_plane_z_mm
 from lfpiv_cli.console import CONSOLE, Console
 from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.files.atomic import ensure_writable, write_json
-from lfpiv_cli.files.config import Config, load_config
+from lfpiv_cli.files.config import Config, load_rig
 from lfpiv_cli.files.images import write_tiff
 from lfpiv_cli.files.inputs import ensure_room
 from lfpiv_cli.files.particles import Particles, write_particles
@@ -192,7 +192,7 @@ def simulate_particles(
     config: Path, output: Path, *, overwrite: bool = False, console: Console = CONSOLE
 ) -> dict[str, Any]:
     """Render images of tracers that follow the configured flow: a pair, or a longer sequence."""
-    images = frame_names(load_config(config).simulation.frames)
+    images = frame_names(load_rig(config).simulation.frames)
     settings, paths = _begin(config, output, (*images, "particles.npz", "particles.json"), overwrite, console)
     scene = settings.simulation
     reference = simulated_reference(settings)
@@ -253,7 +253,7 @@ DLFC_MARGIN = 0.05
 
 def simulate_images(config: Path, images: Path, *, overwrite: bool = False, console: Console = CONSOLE) -> None:
     """Simulate all images of the config's experiment, boards at several depths where its weights need them."""
-    settings = load_config(config)
+    settings = load_rig(config)
     common: dict[str, Any] = {"overwrite": overwrite, "console": console}
     simulate_white(config, images, **common)
     simulate_particles(config, images, **common)
@@ -344,7 +344,7 @@ def _begin(
     config: Path, output: Path, names: tuple[str, ...], overwrite: bool, console: Console
 ) -> tuple[Config, dict[str, Path]]:
     """Read the config and make sure that the outputs can be made and written."""
-    settings, paths = load_config(config), {name: output / name for name in names}
+    settings, paths = load_rig(config), {name: output / name for name in names}
     pixels = math.prod(settings.image_shape())
     seconds, held = PIXEL_S * pixels * sum(name.endswith(".tif") for name in names), float(HELD_BYTES_A_PIXEL * pixels)
     ensure_room(held, f"simulate, for images of {written(pixels)} pixels,", "a sensor with fewer pixels needs less")

@@ -14,7 +14,7 @@ from lfpiv_cli.console import CONSOLE, Console
 from lfpiv_cli.errors import ConfigError, InputError, LimitMissedError, UsageError
 from lfpiv_cli.files import vtkhdf
 from lfpiv_cli.files.atomic import ensure_writable, write_json
-from lfpiv_cli.files.config import Config, load_config
+from lfpiv_cli.files.config import Config, load_rig
 from lfpiv_cli.files.inputs import given
 from lfpiv_cli.files.pages import ensure_drawing, write_picture
 from lfpiv_cli.files.particles import MM_PER_M, read_particles
@@ -58,7 +58,7 @@ def validate_volume(
     inputs = given(config=config, volume=volume, particles=particles)
     report = output / "volume.json"
     ensure_writable(report, overwrite, inputs.values())
-    settings = load_config(config)
+    settings = load_rig(config)
     found, true = vtkhdf.open_volume(volume), read_particles(particles)
     dt_s = settings.correlation.dt_s
     if MOMENTS[frame] and dt_s is None:
@@ -87,7 +87,7 @@ def validate_weights(
     for target in paths.values():
         ensure_writable(target, overwrite, [config])
     ensure_drawing()
-    settings = load_config(config)
+    settings = load_rig(config)
     chosen = settings.validation.weights
     camera, grid = settings.camera_model(), settings.grid()
     rng = np.random.default_rng(chosen.seed)
@@ -152,7 +152,7 @@ def validate_flow(
     is_simulated = vectors is None
     if is_simulated and particles is not None:
         raise UsageError("--particles needs --vectors: the flow of a simulation is known")
-    settings = load_config(config)
+    settings = load_rig(config)
     if is_simulated:
         ensure_experiment(settings)
         console.warn(light_notices(settings))
@@ -216,7 +216,7 @@ def measure_images(
     config: Path, images: Path, output: Path, *, overwrite: bool = False, console: Console = CONSOLE
 ) -> dict[str, Path]:
     """Measure the flow in images that `simulate_images` made, as `run` does; return the vectors by method."""
-    settings = load_config(config)
+    settings = load_rig(config)
     methods = cast(tuple[FlowMethod, ...], settings.flow_methods())
     depths = board_depths(settings) if settings.weights.method == "dlfc" else ()
     recorded = RunOptions(
@@ -313,6 +313,6 @@ def validate_all(config: Path, output: Path, *, overwrite: bool = False, console
 
 def ensure_complete(config: Path) -> None:
     """Refuse a config that lacks what the last of the reports needs before the first is made (ConfigError)."""
-    settings = load_config(config)
+    settings = load_rig(config)
     depths_in_volume(settings)
     ensure_experiment(settings)

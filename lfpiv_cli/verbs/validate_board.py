@@ -16,7 +16,7 @@ from lfpiv_cli.calibration.model import Photographs, Rig, calibrate
 from lfpiv_cli.console import CONSOLE, Console
 from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.files.atomic import ensure_writable, write_json
-from lfpiv_cli.files.config import Config, load_config
+from lfpiv_cli.files.config import Config, load_rig
 from lfpiv_cli.files.pages import ensure_drawing, write_picture
 from lfpiv_cli.files.provenance import record
 from lfpiv_cli.grid import Grid
@@ -86,7 +86,7 @@ def validate_board(
     The pictures are those of the data sheet's camera without noise (ideal), of one with the faults that the section
     simulation gives it (recorded), or both, as validation.board.images has it.
     """
-    settings = load_config(config)
+    settings = load_rig(config)
     chosen = settings.validation.board
     halves = ("ideal", "recorded") if chosen.images == "both" else (chosen.images,)
     depths = depths_in_volume(settings)
