@@ -119,8 +119,6 @@ def finished(task: Task, state: State, settings: Round, checks: int = LAST_CHECK
     Two tracers with one peak are told from one by that noise alone: what is assumed while most are sought leaves bright
     pixels much freedom.
     """
-    # What could not be split or moved may be, now that the noise is known.
-    state = replace(state, unsplit=state.unsplit[:0], unmoved=state.unmoved[:0])
     for check in range(checks):
         state = with_measured_noise(task, state)
         sweep(task, state, LAST_UNEXPLAINED, LAST_SWEEPS)
@@ -129,6 +127,8 @@ def finished(task: Task, state: State, settings: Round, checks: int = LAST_CHECK
             candidates = candidates[light > CANDIDATE_LIGHT * state.typical_light]
             state = accepted(task, state, candidates, replace(settings, unexplained=LAST_UNEXPLAINED))
             sweep(task, state, LAST_UNEXPLAINED, LAST_SWEEPS)
+        # What could not be split or moved may be now.
+        state = replace(state, unsplit=state.unsplit[:0], unmoved=state.unmoved[:0])
         fits = judged(task, state, LAST_UNEXPLAINED)
         state = with_depths_corrected(task, state, fits.chi2, LAST_UNEXPLAINED)
         state = with_overlaps_split(task, state, fits.chi2, LAST_UNEXPLAINED, thorough=True)
