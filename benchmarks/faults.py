@@ -288,7 +288,7 @@ class Bench:
         sensor = rig.true["camera"]["sensor"]
         shape = (sensor["rows"], sensor["columns"])
         names = ("white", "dark", *(["board"] if rig.board else []), "pair_a", "pair_b")
-        pictures = {name: read_image(images / f"{name}.tif", shape).astype(np.float64) for name in names}
+        pictures = {name: read_image(images / f"{name}.tif", shape=shape).astype(np.float64) for name in names}
         return cls(rig, Experiment(rig.reported, pictures, 2.0 ** rig.true["simulation"]["bits"] - 1.0), folder)
 
     def run(self, experiment: Experiment, command: str, *arguments: str, config: Tree | None = None) -> Step:

@@ -212,7 +212,7 @@ def soil(images: Path, rig: DrawnRig) -> None:
     dark = scene["dark_level_counts"]
     for path in images.glob("*.tif"):
         if path.name != "dark.tif":
-            shadowed = dark + passing * (read_image(path, shape) - dark)
+            shadowed = dark + passing * (read_image(path, shape=shape) - dark)
             write_tiff(path, np.rint(np.maximum(shadowed, 0.0)).astype(np.uint16), overwrite=True)
 
 
