@@ -26,7 +26,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from lfpiv_cli.particles.diffusion import NO_FORMS, Forms, Together, forms_of, together_of
-from lfpiv_cli.particles.fitting import Choice, begin_at, fit_best, judge
+from lfpiv_cli.particles.fitting import NO_FURTHER, Choice, begin_at, fit_best, judge
 from lfpiv_cli.particles.least_squares import (
     SMALLEST_GAIN,
     UNKNOWNS,
@@ -515,7 +515,7 @@ def _fit_each(
     own, responses = room_for(1, observation.capacity, 0), room_for(1, sized.capacity, 0)
     starts, prior = np.empty((depths_mm.shape[1], 1, UNKNOWNS)), np.zeros((1, 2 * UNKNOWNS))
     effort = Effort(STEPS, SMALLEST_GAIN)
-    choice = Choice(effort, effort, len(starts), 0.0, np.inf)
+    choice = Choice(effort, NO_FURTHER, len(starts), 0.0, np.inf)
     for number in numbers:
         respond_all(observation.optics, tracers[number : number + 1], own)
         pixels, values = lit_by(own, 0)

@@ -112,7 +112,9 @@ class Choice(NamedTuple):
     brightest: float
 
 
-NOWHERE_ELSE = Choice(Effort(0, 0.0), Effort(0, 0.0), 0, 0.0, np.inf)
+# Where all starts are followed to their ends at once.
+NO_FURTHER = Effort(0, 0.0)
+NOWHERE_ELSE = Choice(NO_FURTHER, NO_FURTHER, 0, 0.0, np.inf)
 
 
 @njit(cache=True)

@@ -27,7 +27,7 @@ from scipy.spatial import KDTree
 
 from lfpiv_cli.arrays import Floats
 from lfpiv_cli.grid import Scale
-from lfpiv_cli.particles.fitting import Choice, begin_at, fit_best, nothing_expected
+from lfpiv_cli.particles.fitting import NO_FURTHER, Choice, begin_at, fit_best, nothing_expected
 from lfpiv_cli.particles.least_squares import (
     CHOICE_GAIN,
     UNKNOWNS,
@@ -237,7 +237,7 @@ def _join(
             two += change_by(pixels, values, particles[member, 3], residual, weight)
         depths[0], depths[1], depths[2] = middle[number, 2], particles[first, 2], particles[second, 2]
         begin_at(view, middle[number], depths, starts)
-        choice = Choice(effort, effort, len(starts), LEAST_LIGHT, brightest[number])
+        choice = Choice(effort, NO_FURTHER, len(starts), LEAST_LIGHT, brightest[number])
         limits = np.inf, two + largest_loss[number]
         joined[number] = fit_best(observation, starts, prior, responses, choice, limits, best) < limits[1]
         if joined[number]:

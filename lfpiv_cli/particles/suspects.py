@@ -14,7 +14,7 @@ from scipy.spatial import KDTree
 
 from lfpiv_cli.arrays import Floats
 from lfpiv_cli.grid import Scale
-from lfpiv_cli.particles.fitting import Choice, fit_again, fit_best
+from lfpiv_cli.particles.fitting import NO_FURTHER, Choice, fit_again, fit_best
 from lfpiv_cli.particles.least_squares import (
     CHOICE_GAIN,
     UNKNOWNS,
@@ -137,8 +137,7 @@ def _split(
 # Starts relative to the particle's depth, in depths over which light spreads by one lens (Table 2: 0.2 to 2 mm); its
 # mirrored depth is another.
 OTHER_DEPTHS = np.array([-2.0, -1.5, -1.0, -0.7, -0.4, -0.2, 0.2, 0.4, 0.7, 1.0, 1.5, 2.0]) / 1.064
-# Steps from each of them, and from the best ones on.
-DEPTH_STEPS, STEPS = 8, 8
+STEPS = 8
 
 
 def try_other_depths(
@@ -156,9 +155,9 @@ def try_other_depths(
     depth = particles[:, 2:3]
     starts = np.concatenate([depth + OTHER_DEPTHS * observation.optics.scale.depth_mm, -depth], axis=1)
     starts[(starts < observation.low_mm) | (starts > observation.high_mm)] = np.nan
-    first, then = Effort(DEPTH_STEPS, CHOICE_GAIN), Effort(STEPS, CHOICE_GAIN)
-    choice = Choice(first, then, FINALISTS, smallest_light, np.inf)
-    return fit_again(observation, particles, suspects, then, starts, choice, smallest_gain, prior).moved
+    effort = Effort(STEPS, CHOICE_GAIN)
+    choice = Choice(effort, NO_FURTHER, FINALISTS, smallest_light, np.inf)
+    return fit_again(observation, particles, suspects, effort, starts, choice, smallest_gain, prior).moved
 
 
 # Particles that fit worse than good ones by this factor are suspects.
