@@ -1,6 +1,7 @@
 """Commands run in this process, and what they are run on: the sample, or Table 2's camera with a small sensor."""
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -8,6 +9,7 @@ import pytest
 import yaml
 
 from lfpiv_cli.cli.main import cli
+from lfpiv_cli.errors import InputError
 
 ROOT = Path(__file__).parent.parent
 
@@ -58,3 +60,15 @@ def table2_rig(columns: int, rows: int, layout: str = "square", **sections: dict
         "sensor": {"pixel_um": 5.5, "columns": columns, "rows": rows},
     }
     return str(yaml.safe_dump({"camera": camera, "media": {"air": 1.0, "window": 1.49, "fluid": 1.33}} | sections))
+
+
+def refused(read: Callable[[], object], *words: str) -> bool:
+    """Return whether a read is refused with an `InputError` that holds the words; other exceptions pass through."""
+    try:
+        read()
+    except InputError as error:
+        message = str(error)
+    else:
+        return False
+    assert all(word in message for word in words), message
+    return True

@@ -22,7 +22,7 @@ from lfpiv_cli.files.provenance import record
 from lfpiv_cli.files.vtkhdf import open_vectors, open_volume, read_header, write_vectors, write_volume
 from lfpiv_cli.flow.field import VectorField
 from lfpiv_cli.grid import Grid, Reference
-from tests.commands import ROOT
+from tests.commands import ROOT, refused
 from tests.hostile_files import edited
 
 GRID = Grid.centred((4, 3, 2), (0.1, 0.2, 0.3), (1.0, 2.0, 3.0))
@@ -51,18 +51,6 @@ def save_tree(path: Path) -> Path:
 
 def load_tree(path: Path) -> dict:
     return read_tree(path, "lfpiv-test", 2)[0]
-
-
-def refused(read: Callable[[], object], *words: str) -> bool:
-    """Return whether a read is refused with an `InputError` that holds the words; other exceptions pass through."""
-    try:
-        read()
-    except InputError as error:
-        message = str(error)
-    else:
-        return False
-    assert all(word in message for word in words), message
-    return True
 
 
 def test_an_array_has_a_unit_and_json_no_nan(tmp_path: Path) -> None:

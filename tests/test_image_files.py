@@ -12,7 +12,6 @@ import sys
 import time
 import tracemalloc
 import zlib
-from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -28,7 +27,7 @@ from lfpiv_cli.files.listing import ensure_verified
 from lfpiv_cli.files.recordings import formats
 from lfpiv_cli.files.recordings.recording import taken_complaints
 from tests import camera_files
-from tests.commands import CONFIG, ROOT, SAMPLE
+from tests.commands import CONFIG, ROOT, SAMPLE, refused
 from tests.hostile_files import ended
 
 ROWS, COLUMNS = 448, 600
@@ -287,18 +286,6 @@ def test_written_images_read_back_and_hold_no_time(tmp_path: Path) -> None:
 def test_the_experiments_images(data_folder: Path) -> None:
     image = read_single(data_folder / "channel" / "dark.tif", (1768, 2352))
     assert image.mean() == pytest.approx(96.0, abs=0.1)  # the dark level, read noise 6 over four million pixels
-
-
-def refused(read: Callable[[], object], *words: str) -> bool:
-    """Return whether a read is refused with an `InputError` that holds the words; other exceptions pass through."""
-    try:
-        read()
-    except InputError as error:
-        message = str(error)
-    else:
-        return False
-    assert all(word in message for word in words), message
-    return True
 
 
 def directories(count: int, tags: tuple[int, ...] = (256, 257, 273)) -> bytes:

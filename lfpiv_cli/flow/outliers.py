@@ -182,8 +182,8 @@ def validate_vectors(
         if round_number:
             # Only what has lost or won a neighbour.
             again = np.flatnonzero(binary_dilation(before != usable, np.ones((3, 3, 3), dtype=np.bool_)))
-        reported = predict(displacement, usable, ~masked, again)
-        for kept, new in zip(flat, reported, strict=True):
+        renewed = predict(displacement, usable, ~masked, again)
+        for kept, new in zip(flat, renewed, strict=True):
             kept[again] = new
         limit = THRESHOLD * (spread + noise)
         judged = measured & ~masked & (share >= NEEDED_SHARE)

@@ -53,10 +53,10 @@ def focal_length_of(view: View, particles: Floats, residual: Floats, weight: Flo
     room = max(entry_capacity(each, depth.min(), depth.max()) for each in views)
     nearest = np.argsort(np.hypot(particles[:, 0], particles[:, 1]), kind="stable")[:MOST_PARTICLES]
     steps = [_step(views, particle, residual, weight, room) for particle in particles[nearest]]
-    reported = np.array([step for step in steps if step is not None]).reshape(-1, 2)
-    if len(reported) < FEWEST_PARTICLES:
+    found = np.array([step for step in steps if step is not None]).reshape(-1, 2)
+    if len(found) < FEWEST_PARTICLES:
         return None
-    middle, error = middle_of(Sizes(*(STEP * reported.T)))
+    middle, error = middle_of(Sizes(*(STEP * found.T)))
     return FocalLength(middle, error)
 
 
@@ -83,8 +83,8 @@ def _step(
     kept = np.linalg.qr(own.T)[0]
     design, rest = particle[3] * (longer[0] - own[0]), residual[pixels] * root
     design, rest = (each - kept @ (kept.T @ each) for each in (design, rest))
-    reported, freedom = float(np.sum(design**2)), np.count_nonzero(root) - UNKNOWNS - 1
-    if not reported > 0.0 or freedom < 1:
+    information, freedom = float(np.sum(design**2)), np.count_nonzero(root) - UNKNOWNS - 1
+    if not information > 0.0 or freedom < 1:
         return None
     scatter = max(float(np.sum(rest**2)) / freedom, 1.0)
-    return float(np.sum(design * rest)) / reported, float(np.sqrt(scatter / reported))
+    return float(np.sum(design * rest)) / information, float(np.sqrt(scatter / information))

@@ -169,8 +169,8 @@ def planes_figure(field: VectorField) -> style.Figure:
     """Vectors in the three middle planes. Arrows show the components in the plane, colour the one across it; both have
     one scale in all three. Crosses are vectors that are missing.
     """
-    reported = shown(field)
-    return compared_figure(field.grid, {"": reported.values}, reported.unit)
+    quantity = shown(field)
+    return compared_figure(field.grid, {"": quantity.values}, quantity.unit)
 
 
 @style.styled
@@ -217,9 +217,9 @@ def speed_unit(*velocities_m_s: Floats) -> tuple[float, str]:
 
 def components_figure(field: VectorField) -> style.Figure:
     """Each velocity component in the three middle planes, a row and a scale for each."""
-    reported = shown(field)
-    each = [(name, [reported.values[..., component]] * 3) for component, name in enumerate(style.COMPONENT_NAMES)]
-    rows = [MapRow(maps, [name] * 3, f"{name} ({reported.unit})", signed_scale(maps)) for name, maps in each]
+    quantity = shown(field)
+    each = [(name, [quantity.values[..., component]] * 3) for component, name in enumerate(style.COMPONENT_NAMES)]
+    rows = [MapRow(maps, [name] * 3, f"{name} ({quantity.unit})", signed_scale(maps)) for name, maps in each]
     return maps_figure(field.grid, rows)
 
 
@@ -238,22 +238,22 @@ def profiles_figure(field: VectorField) -> style.Figure:
 
     The band is an rms over the plane, drawn where it is known.
     """
-    reported = shown(field)
+    quantity = shown(field)
     figure, axes = style.new_panels(10.0, 7.5, 3, 3, sharey="row", sharex="col")
     for (component, axis), panel in np.ndenumerate(axes):
         others = tuple(k for k in range(3) if k != 2 - axis)
         places, colour = field.grid.axis_mm(axis), style.COLOURS[component]
-        mean = mean_of_known(reported.values[..., component], others)
+        mean = mean_of_known(quantity.values[..., component], others)
         panel.axhline(0.0, color=style.GREY, linewidth=0.8)
         panel.plot(places, mean, "o-", color=colour)
-        if reported.sigma is not None:
-            sigma = np.sqrt(mean_of_known(reported.sigma[..., component] ** 2, others))
+        if quantity.sigma is not None:
+            sigma = np.sqrt(mean_of_known(quantity.sigma[..., component] ** 2, others))
             band: dict[str, Any] = {"color": colour, "alpha": 0.25, "linewidth": 0.0}
             panel.fill_between(places, mean - sigma, mean + sigma, label="± σ of one vector", **band)
     for k in range(3):
-        axes[k, 0].set_ylabel(f"{style.COMPONENT_NAMES[k]} ({reported.unit}), mean over the plane")
+        axes[k, 0].set_ylabel(f"{style.COMPONENT_NAMES[k]} ({quantity.unit}), mean over the plane")
         axes[-1, k].set_xlabel(f"{style.AXIS_NAMES[k]} (mm)")
-    if reported.sigma is not None:
+    if quantity.sigma is not None:
         axes[0, 0].legend()
     return figure
 
@@ -278,19 +278,19 @@ def sigma_figure(field: VectorField) -> style.Figure:
     """
     from matplotlib.colors import LogNorm
 
-    reported = shown(field)
-    if reported.sigma is None:
+    quantity = shown(field)
+    if quantity.sigma is None:
         raise ValueError("the field states no uncertainty")
-    known = reported.sigma[np.isfinite(reported.sigma) & (reported.sigma > 0.0)]
+    known = quantity.sigma[np.isfinite(quantity.sigma) & (quantity.sigma > 0.0)]
     low, high = np.percentile(known, SCALE_PERCENT) if known.size else (0.1, 1.0)
     if low == high:
         low, high = 0.5 * low, 2.0 * high
     label, scale = (
-        f"stated standard deviation ({reported.unit})",
+        f"stated standard deviation ({quantity.unit})",
         {"cmap": style.SEQUENTIAL, "norm": LogNorm(low, high)},
     )
     each = [
-        ([reported.sigma[..., component]] * 3, [f"σ of {name}"] * 3)
+        ([quantity.sigma[..., component]] * 3, [f"σ of {name}"] * 3)
         for component, name in enumerate(style.COMPONENT_NAMES)
     ]
     return maps_figure(field.grid, [MapRow(maps, titles, label, scale) for maps, titles in each], shrink=0.6)

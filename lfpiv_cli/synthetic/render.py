@@ -122,7 +122,7 @@ def render_points(
     points = camera.to_image_axes(balls.points_mm).reshape(-1, 3)
     light = np.broadcast_to(np.asarray(balls.light, dtype=np.float64), len(points))
     radii = np.broadcast_to(0.5 * np.asarray(balls.diameter_mm, dtype=np.float64), len(points)).copy()
-    image, reported = np.zeros((camera.rows, camera.columns)), progress or (lambda done: None)
+    image, advance = np.zeros((camera.rows, camera.columns)), progress or (lambda done: None)
     if waves is not None:
         inside, seen = points_in_ball(waves.points), WavesInCamera(camera, space, waves)
         for part in blocks(len(points), PATCHES_AT_ONCE):
@@ -133,7 +133,7 @@ def render_points(
             for i, patch in zip(numbers, patches, strict=True):
                 if patch is not None:
                     patch.add_to(image, light[i])
-            reported(len(numbers))
+            advance(len(numbers))
         return image
 
     blur, shifts = diffused_mm(camera) if blur_mm is None else blur_mm, rng.random((len(points), 4))
@@ -152,7 +152,7 @@ def render_points(
         of_part = tuple(each[part] for each in placed)
         share_out(kernel, len(pixels), of_part, *between, camera.for_kernels(), camera.objective, blur, pixels)
         _add_light(image.ravel(), pixels, light[part] / rays)
-        reported(len(pixels))
+        advance(len(pixels))
     return image
 
 
