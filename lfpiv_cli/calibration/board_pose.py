@@ -284,6 +284,16 @@ def lens_in_scene_mm(camera: Camera) -> tuple[float, float]:
     return lens, lens / camera.aperture_radius_mm * camera.focus_distance_mm
 
 
+def off_focus_mm(board: BoardGeometry, camera: Camera, medium: Media) -> float:
+    """Return how far from the focal plane a dot's light is two microlenses wide.
+
+    From rim to rim of the aperture light spreads by one more over each depth unit; a ray of the rim moves from the
+    axis by half of that.
+    """
+    scale = camera.scale(medium)
+    return (2.0 - board.dot_diameter_mm / scale.lens_mm) * scale.depth_mm
+
+
 def on_the_grid(dots_mm: Floats, board: BoardGeometry) -> tuple[Integers, Integers]:
     """Return which dots belong to the board (m,) and their indices on it (m, 2); dots may be missing."""
     refuse_few(len(dots_mm), board)
@@ -361,12 +371,12 @@ def refuse_scattered(fit: FlatFit, board: BoardGeometry, camera: Camera, medium:
     sideways = float(np.sqrt(2.0 * np.sum(fit.residual_mm[:, :2] ** 2) / max(1, freedom)))
     lens, lens_depth = lens_in_scene_mm(camera)
     if sideways > LARGEST_SCATTER * board.spacing_mm:
-        dot, further = board.dot_diameter_mm / lens, lens_depth / medium.depth_ratio
+        dot = board.dot_diameter_mm / lens
         check = "board.spacing_mm and that the picture shows the board"
         if board.pattern == "dots" and dot < 1.0 and sideways < lens:
             check = (
                 f"the focus first: dots {written(dot, 2)} microlenses wide may lie anywhere in their lenses near the "
-                f"focal plane; move the board by {written((2.0 - dot) * further, 2)} mm off it, "
+                f"focal plane; move the board by {written(off_focus_mm(board, camera, medium), 2)} mm off it, "
                 f"or take dots of two microlenses, {written(2.0 * lens, 2)} mm; then {check}"
             )
         raise InputError(

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from lfpiv_cli.calibration.board_pose import BoardGeometry, BoardPose, lens_in_scene_mm
+from lfpiv_cli.calibration.board_pose import BoardGeometry, BoardPose, lens_in_scene_mm, off_focus_mm
 from lfpiv_cli.calibration.lattice import EXPONENTS, LatticeFit
 from lfpiv_cli.calibration.light_checks import LARGEST_FIELD_DEPTH, field_depth
 from lfpiv_cli.errors import ConfigError, InputError
@@ -173,17 +173,17 @@ def board_notices(pose: BoardPose, board: BoardGeometry, camera: Camera, media: 
         )
         yield Notice("field-curved", "board image", text, remedy, depth.value, f"within {written(largest, 2)} mm")
     # A dot's light in microlenses, at its depth from the focal plane.
-    scale = camera.scale(board.seen_through(media))
-    dot = board.dot_diameter_mm / scale.lens_mm
-    wide = dot + abs(pose.z0_mm) / scale.depth_mm
+    medium = board.seen_through(media)
+    scale = camera.scale(medium)
+    wide = board.dot_diameter_mm / scale.lens_mm + abs(pose.z0_mm) / scale.depth_mm
     if dots and wide < 1.0:
         text = (
             f"at its depth a dot's light is {written(wide, 2)} microlenses wide: where it falls into one it "
             "may lie anywhere in it, and the magnification is up to 2 % off, several of its standard errors"
         )
         remedy = (
-            f"move the board by {written((2.0 - dot) * scale.depth_mm, 2)} mm off the focal plane, or take dots of two "
-            "microlenses"
+            f"move the board by {written(off_focus_mm(board, camera, medium), 2)} mm off the focal plane, or take dots "
+            "of two microlenses"
         )
         yield Notice("board-within-lenses", "board.dot_diameter_mm", text, remedy, wide, "at least 1")
 

@@ -249,32 +249,44 @@ class WindowGrid:
             return np.ones(self.centres.shape_zyx)
         return self.walls.shares(self.centres.centres_mm(), self.sides_mm)
 
+    def masked(self) -> Flags:
+        """Return which windows (nz, ny, nx) lie beyond the walls."""
+        return np.asarray(self.inside() < SMALLEST_VALID_FRACTION)
+
+    def vectors(self, displacement_mm: Floats, sigma_mm: Floats, dt_s: float | None) -> VectorField:
+        """Return the field of displacements (m, 3) at the centres, NaN where there is none, and their standard errors.
+
+        What only a correlation knows is NaN.
+        """
+        inside, masked, voxel_mm = self.inside(), self.masked(), self.volume.spacing_mm
+        found = np.isfinite(displacement_mm).all(axis=-1).reshape(masked.shape) & ~masked
+        displacement, sigma = (
+            np.where(found[..., np.newaxis], values.reshape(*masked.shape, 3) / voxel_mm, np.nan)
+            for values in (displacement_mm, sigma_mm)
+        )
+        unknown = np.full(masked.shape, np.nan)
+        return VectorField(
+            grid=self.centres,
+            displacement_voxel=displacement,
+            displacement_raw_voxel=displacement,
+            correlation=unknown,
+            peak_ratio=unknown,
+            valid_fraction=np.where(found | masked, inside, 0.0),
+            flag=np.where(masked, MASKED, np.where(found, VALID, REJECTED)).astype(np.uint8),
+            uncertainty_voxel=sigma,
+            voxel_mm=voxel_mm,
+            dt_s=dt_s,
+            window_voxel=self.size,
+        )
+
 
 def vectors_from_paths(paths: Paths, windows: WindowGrid, dt_s: float | None) -> VectorField:
     """Return the vectors at the centres of windows; what only a correlation knows is NaN."""
-    grid, voxel_mm = windows.centres, windows.volume.spacing_mm
-    nodes = grid.centres_mm()
-    reach = REACH_WINDOWS * max(n * d for n, d in zip(windows.size, voxel_mm, strict=True))
-    values, errors = on_grid(paths.middle_mm, paths.displacement_mm, paths.sigma_mm, nodes.reshape(-1, 3), reach)
-    inside = windows.inside()
-    masked = inside < SMALLEST_VALID_FRACTION
-    displacement = np.where(masked[..., np.newaxis], np.nan, values.reshape(nodes.shape) / voxel_mm)
-    displacement[without_tracks(paths.middle_mm, nodes.reshape(-1, 3), windows).reshape(masked.shape)] = np.nan
-    found = np.isfinite(displacement).all(axis=-1)
-    unknown = np.full(found.shape, np.nan)
-    return VectorField(
-        grid=grid,
-        displacement_voxel=displacement,
-        displacement_raw_voxel=displacement,
-        correlation=unknown,
-        peak_ratio=unknown,
-        valid_fraction=np.where(found | masked, inside, 0.0),
-        flag=np.where(masked, MASKED, np.where(found, VALID, REJECTED)).astype(np.uint8),
-        uncertainty_voxel=errors.reshape(nodes.shape) / voxel_mm,
-        voxel_mm=voxel_mm,
-        dt_s=dt_s,
-        window_voxel=windows.size,
-    )
+    nodes = windows.centres.centres_mm().reshape(-1, 3)
+    reach = REACH_WINDOWS * float(windows.sides_mm.max())
+    values, errors = on_grid(paths.middle_mm, paths.displacement_mm, paths.sigma_mm, nodes, reach)
+    values[without_tracks(paths.middle_mm, nodes, windows)] = np.nan
+    return windows.vectors(values, errors, dt_s)
 
 
 def without_tracks(middle_mm: Floats, nodes_mm: Floats, windows: WindowGrid) -> Flags:

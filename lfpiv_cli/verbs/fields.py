@@ -24,12 +24,9 @@ from lfpiv_cli.files.particle_file import TRACKS_FORMAT, TRAJECTORIES_FORMAT, Po
 from lfpiv_cli.files.provenance import OF_COORDINATES, ensure_agreement, record
 from lfpiv_cli.flow import field as vector_field
 from lfpiv_cli.flow.combining import Paths, WindowGrid, vectors_from_paths, without_tracks
-from lfpiv_cli.flow.correlation import SMALLEST_VALID_FRACTION
 from lfpiv_cli.flow.field import (
-    MASKED,
     MM_TO_M,
     REJECTED,
-    VALID,
     Derived,
     VectorField,
     derived_fields,
@@ -132,35 +129,14 @@ class FittedField:
 
     def without(self) -> NDArray[np.bool_]:
         """Return at which windows' centres (nz, ny, nx) there is no vector: none near, or beyond walls."""
-        nodes, masked = self.windows.centres.centres_mm().reshape(-1, 3), self.masked()
+        nodes, masked = self.windows.centres.centres_mm().reshape(-1, 3), self.windows.masked()
         return np.asarray(masked | without_tracks(self.middles_mm, nodes, self.windows).reshape(masked.shape))
-
-    def masked(self) -> NDArray[np.bool_]:
-        """Return which windows' centres (nz, ny, nx) lie beyond walls."""
-        return np.asarray(self.windows.inside() < SMALLEST_VALID_FRACTION)
 
     def vectors(self) -> VectorField:
         """Return the vectors at the windows' centres; none where no sample is near, and none beyond walls."""
-        windows, voxel_mm = self.windows, self.windows.volume.spacing_mm
-        grid, inside, masked, without = windows.centres, windows.inside(), self.masked(), self.without()
-        shape = (*grid.shape_zyx, 3)
-        value, variance = self.field.estimate_at(grid.centres_mm().reshape(-1, 3))
-        displacement, sigma = value.reshape(shape) / voxel_mm, np.sqrt(variance).reshape(shape) / voxel_mm
-        displacement[without], sigma[without] = np.nan, np.nan
-        unknown = np.full(masked.shape, np.nan)
-        return VectorField(
-            grid=grid,
-            displacement_voxel=displacement,
-            displacement_raw_voxel=displacement,
-            correlation=unknown,
-            peak_ratio=unknown,
-            valid_fraction=np.where(without & ~masked, 0.0, inside),
-            flag=np.where(masked, MASKED, np.where(without, REJECTED, VALID)).astype(np.uint8),
-            uncertainty_voxel=sigma,
-            voxel_mm=voxel_mm,
-            dt_s=self.dt_s,
-            window_voxel=windows.size,
-        )
+        value, variance = self.field.estimate_at(self.windows.centres.centres_mm().reshape(-1, 3))
+        value[self.without().reshape(-1)] = np.nan
+        return self.windows.vectors(value, np.sqrt(variance), self.dt_s)
 
 
 def fit_field(
