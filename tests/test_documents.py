@@ -133,6 +133,21 @@ def test_architecture_and_glossary_name_parts_of_the_package() -> None:
     assert len((ROOT / "README.md").read_text().splitlines()) <= 80
 
 
+def test_equations_name_what_computes_and_what_holds_them() -> None:
+    text = (ROOT / "docs" / "equations.md").read_text(encoding="utf-8")
+    paper = text.split("## The paper's", 1)[1].split("\n## ", 1)[0]
+    numbers = {int(number) for row in re.findall(r"^\| ([\d, ]+) \|", paper, re.MULTILINE) for number in row.split(", ")}
+    assert numbers == set(range(1, 22))
+    rows = [line.split(" | ")[-2:] for line in text.splitlines() if line.startswith("| ") and "`" in line]
+    for computed, held in rows:
+        for folder, cell in (("lfpiv_cli", computed), ("tests", held)):
+            named = re.findall(r"`([\w/]+\.py)(?::(\w+))?`", cell)
+            assert named, cell
+            for file, name in named:
+                source = (ROOT / folder / file).read_text(encoding="utf-8")
+                assert not name or re.search(rf"^\s*(def|class) {name}\b", source, re.MULTILINE), f"{file}: {name}"
+
+
 # What a reader who knows the field searches for, and the command whose help has to say it.
 TERMS = {
     "particle tracking velocimetry": "track",
