@@ -13,7 +13,6 @@ from __future__ import annotations
 import argparse
 import copy
 import itertools
-import re
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -26,23 +25,13 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from benchmarks.rig_drawing import DrawnRig, Tree, draw
-from benchmarks.rigs import Step, photograph_white, run_command, soil
+from benchmarks.rigs import ADVICE, Step, codes, photograph_white, run_command, soil
 from lfpiv_cli.calibration.lattice import fit_lattice
 from lfpiv_cli.files.images import read_image, write_tiff
 
 SEED, RIGS, GOOD = 20261122, 2, 10
 # Microlenses along the sensor's sides: fewer than `rigs` has, as pictures are only looked at.
 LENSES = (34, 26)
-# Advice on what a good rig measures or believes, which says nothing against its pictures.
-ADVICE = {
-    "few-tracers",
-    "no-uncertainty",
-    "windows-too-large",
-    "volume-out-of-view",
-    "heavy-work",
-    "few-particles",
-    "no-board",
-}
 # Tracers for each microlens that are enough for lens images to be seen by their light, and that leave some dark.
 DENSITY = (0.05, 1.0)
 
@@ -375,13 +364,6 @@ def told_by(steps: Sequence[Step]) -> str:
         if step.exit_code:
             return f"refused: {step.error}" if step.exit_code != 1 else f"{CRASH}: {step.error}"
     return ", ".join(code for code in codes(steps) if code not in ADVICE)
-
-
-def codes(steps: Sequence[Step]) -> list[str]:
-    """Return the codes of what was warned of, each once; a warning that has none as it is."""
-    texts = [text for step in steps for text in step.warnings]
-    found = (re.search(r"\[([a-z-]+)\]$", text) for text in texts)
-    return list(dict.fromkeys(match.group(1) if match else text for match, text in zip(found, texts, strict=True)))
 
 
 def false_alarms(bench: Bench) -> list[str]:

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -43,6 +43,14 @@ FILLED = 0.8
 # Rays of each tracer, and of all of an image's: where tracers are many, neighbours cost more accuracy than rays' noise.
 RAYS, ALL_RAYS = (8_000, 40_000), 2e7
 DT_S = 1e-3
+# Hard conditions, each on this share of the rigs. Of a board: how wide its dots are and how far apart at least, in
+# microlenses, and how far off the focal plane it stands, in depth units. Haze in its brightest place, over the
+# brightest pixels of tracers; what the sensor's corners lose of the light; moves, in microlenses across and depth units
+# along; the share of the lit depth that the owner takes for the volume.
+HARD_SHARE = 0.35
+DOT_LENSES, LEAST_SPACING_LENSES, BOARD_UNITS = (0.4, 3.0), 2.4, 3.0
+HAZE, FALLOFF, SHALLOW = (0.02, 0.5), (0.1, 0.6), (0.6, 0.9)
+REACH_LENSES, REACH_UNITS = (2.0, 15.0), (0.3, 1.2)
 # What one owner in five has wrong, and by how much.
 WRONG_SHARE = 0.2
 WRONG = {
@@ -65,6 +73,8 @@ class DrawnRig:
     dirt : specks on the sensor
     lens_mm, depth_mm : the units of lengths in the scene, see above
     density : tracers for each microlens
+    hard : the conditions that make it hard
+    haze : counts of haze behind the lenses of the tracers' images, where it is brightest
     """
 
     number: int
@@ -76,6 +86,8 @@ class DrawnRig:
     lens_mm: float
     depth_mm: float
     density: float
+    hard: tuple[str, ...] = ()
+    haze: float = 0.0
 
     def name(self) -> str:
         """Return a line that tells what rig it is."""
@@ -87,6 +99,7 @@ class DrawnRig:
             f"M {lens['magnification']:.2f} f/{lens['focal_length_mm'] / lens['aperture_mm']:.1f} {pitch_px:.0f} px "
             f"{array['layout'][:3]} {sensor['pixel_um']} um, n {self.true['media']['fluid']:.2f}, {scene['bits']} bit, "
             f"{seen}{', wrong ' + self.wrong if self.wrong else ''}"
+            f"{', hard: ' + ', '.join(self.hard) if self.hard else ''}"
         )
 
 
@@ -97,6 +110,44 @@ def draw(seed: int, number: int, lenses: tuple[int, int] | None = None) -> Drawn
         rig = _drawn(rng, number, lenses)
         if rig is not None:
             return rig
+
+
+def hardened(rig: DrawnRig, seed: int) -> DrawnRig:
+    """Return the rig under hard conditions, which the seed draws; its owner knows of none of them but the board."""
+    rng = np.random.default_rng([seed, rig.number, 1])
+    true, reported = copy.deepcopy(rig.true), copy.deepcopy(rig.reported)
+    scene, lens_mm, depth_mm, index = true["simulation"], rig.lens_mm, rig.depth_mm, true["media"]["fluid"]
+    hard = {name for name in ("board", "haze", "falloff", "reach", "outside") if rng.random() < HARD_SHARE}
+    if rig.board and "board" in hard:
+        camera = true["camera"]
+        sides = np.array([camera["sensor"][side] for side in ("columns", "rows")])
+        array = camera["microlenses"]
+        field = sides * camera["sensor"]["pixel_um"] * 1e-3 / array["pitch_mm"] * lens_mm
+        diameter = lens_mm * _log_uniform(rng, *DOT_LENSES)
+        spacing = max(diameter * rng.uniform(3.5, 5.0), LEAST_SPACING_LENSES * lens_mm)
+        dots = np.clip(np.floor(field / spacing), 3, 15).astype(int).tolist()
+        lengths = {"dots": dots, "spacing_mm": round(spacing, 5), "dot_diameter_mm": round(diameter, 5)}
+        for tree in (true, reported):
+            tree["board"] |= lengths
+        scene["board_z_mm"] = round(float(rng.uniform(-BOARD_UNITS, BOARD_UNITS)) * depth_mm / index, 4)
+    if "falloff" in hard:
+        scene["objective"] = {"falloff": round(float(rng.uniform(*FALLOFF)), 3)}
+    if "reach" in hard:
+        per_s = 1e-3 / DT_S
+        across = _log_uniform(rng, *REACH_LENSES) * lens_mm * per_s
+        along = _log_uniform(rng, *REACH_UNITS) * depth_mm * per_s
+        turn = rng.uniform(0.0, 2.0 * np.pi)
+        moved = np.array([across * np.cos(turn), across * np.sin(turn), along * rng.choice([-1.0, 1.0])])
+        scene["flow"]["velocity_m_s"] = moved.round(6).tolist()
+    if "outside" in hard:
+        size = reported["volume"]["size_mm"]
+        size[2] = round(size[2] * float(rng.uniform(*SHALLOW)), 4)
+    # A tracer's light where it stays within one lens.
+    pitch_px = true["camera"]["microlenses"]["pitch_mm"] / true["camera"]["sensor"]["pixel_um"] * 1e3
+    brightest = scene["particle_counts"] / (0.25 * np.pi * pitch_px**2)
+    haze = round(brightest * _log_uniform(rng, *HAZE), 1) if "haze" in hard else 0.0
+    met = tuple(sorted(hard if rig.board else hard - {"board"}))
+    return replace(rig, true=true, reported=reported, hard=met, haze=haze)
 
 
 def _log_uniform(rng: np.random.Generator, low: float, high: float) -> float:

@@ -13,11 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.rig_drawing import DT_S, DrawnRig
+from lfpiv_cli.files.calibration_file import open_calibration
 from lfpiv_cli.files.config import Config
 from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, TRACKS_FORMAT, read_points
 from lfpiv_cli.files.particles import read_particles
 from lfpiv_cli.files.vtkhdf import open_vectors
 from lfpiv_cli.flow.field import REJECTED
+from lfpiv_cli.grid import Grid
 from lfpiv_cli.particles.view import raw_view
 from lfpiv_cli.synthetic.flows import MM_PER_M, Flow, advect
 from lfpiv_cli.synthetic.render import RAYS
@@ -58,8 +60,20 @@ class Truth:
     flow: Flow
 
 
-def truth_of(settings: Config, images: Path) -> Truth:
-    """Return the truth of the first image of a simulated pair."""
+def judge_calibration(rig: DrawnRig, calibration: Path) -> Figures:
+    """Return how far the board's magnification is off, as a share, and its standard error."""
+    pose = open_calibration(calibration).pose
+    true = rig.true["camera"]["main_lens"]["magnification"]
+    if pose is None:
+        return {}
+    return {
+        "magnification_off": pose.magnification / true - 1.0,
+        "magnification_sigma": pose.magnification_sigma / abs(true),
+    }
+
+
+def truth_of(settings: Config, images: Path, grid: Grid) -> Truth:
+    """Return the truth of the first image of a simulated pair; `grid` is of the volume that is measured."""
     reference = simulated_reference(settings)
     seeded = read_particles(images / "particles.npz")
     moved = advect(settings.simulated_flow(reference), seeded.positions_mm, -0.5 * DT_S)
@@ -70,7 +84,6 @@ def truth_of(settings: Config, images: Path) -> Truth:
     slope = slopes(view, tracers)
     per_ray = scene.particle_counts / (scene.rays or RAYS)
     bound = cramer_rao_bound(slope, pixel_variance(expected_image(slope, tracers), readout_of(settings), per_ray))
-    grid = settings.grid()
     position = reference.points_from_focal_point(moved)
     bounds = np.array([grid.bounds_mm(axis) for axis in range(3)])
     inside = np.all((position >= bounds[:, 0]) & (position <= bounds[:, 1]), axis=1)

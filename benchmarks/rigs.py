@@ -1,21 +1,24 @@
 """Other people's rigs: whole experiments on cameras drawn at random, by the program's own commands, against the truth.
 
-    python -m benchmarks rigs [--seed S] [--rigs N] [--only K] [--json FILE] [--without-volumes]
+    python -m benchmarks rigs [--hard] [--seed S] [--rigs N] [--only K] [--json FILE] [--without-volumes]
 
 Each is simulated with its camera as it is (white, dark, board or none, a pair of tracers' images, dirt on the sensor),
-then calibrated, reconstructed and measured with its owner's configuration. What came of it is one of
+then calibrated, reconstructed and measured with its owner's configuration. With `--hard` there are boards of dots of
+0.4 to 3 microlenses up to three depth units off the focal plane, haze, falloff, long moves, and tracers outside the
+volume. What came of it is one of
 
 - refused: a sentence before the work starts,
 - failed: a sentence later on, or a crash,
 - warned: a result that is wrong, with a warning,
 - silent: a result that is wrong without one,
-- worked.
+- worked: of these, how many were warned of something that is wrong with their pictures although all is right.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import re
 import tempfile
 import time
 import warnings
@@ -29,8 +32,15 @@ import numpy as np
 import yaml
 from click.testing import CliRunner
 
-from benchmarks.rig_drawing import DrawnRig, draw
-from benchmarks.rig_judging import Figures, judge_particles, judge_tracks, judge_vectors, truth_of
+from benchmarks.rig_drawing import DrawnRig, draw, hardened
+from benchmarks.rig_judging import (
+    Figures,
+    judge_calibration,
+    judge_particles,
+    judge_tracks,
+    judge_vectors,
+    truth_of,
+)
 from lfpiv_cli.cli.main import cli
 from lfpiv_cli.errors import LfpivError
 from lfpiv_cli.files.config import load_rig
@@ -50,8 +60,21 @@ SPECK_PX, SPECK_DEPTH = (0.7, 4.0), (0.1, 0.8)
 # less than this share of the tracers found is followed into the second image.
 SMALLEST_TRACKED = 0.5
 WRONG_SLOPE, SMALLEST_RECALL, SMALLEST_COVERAGE, FEWEST = 0.02, 0.5, 0.8, 20
+# A magnification is wrong that is off by more, and by more than so many of its standard errors.
+WRONG_MAGNIFICATION, WRONG_SIGMAS = 0.002, 3.0
 # Tracers are bright where at least this share of them could be told from noise alone.
 BRIGHT_SHARE = 0.5
+
+# Advice on what a good rig measures or believes, which says nothing against its pictures.
+ADVICE = {
+    "few-tracers",
+    "no-uncertainty",
+    "windows-too-large",
+    "volume-out-of-view",
+    "heavy-work",
+    "few-particles",
+    "no-board",
+}
 
 
 @dataclass
@@ -72,6 +95,7 @@ class Outcome:
     number: int
     name: str
     wrong_value: str
+    hard: tuple[str, ...] = ()
     steps: list[Step] = field(default_factory=list)
     figures: Figures = field(default_factory=dict)
     faults: list[str] = field(default_factory=list)
@@ -95,6 +119,7 @@ def bench_rigs(arguments: Sequence[str] = ()) -> None:
     parser = argparse.ArgumentParser(prog="python -m benchmarks rigs")
     parser.add_argument("--seed", type=int, default=SEED)
     parser.add_argument("--rigs", type=int, default=RIGS)
+    parser.add_argument("--hard", action="store_true", help="under hard conditions")
     parser.add_argument("--only", type=int, action="append", help="number of a rig; repeatable")
     parser.add_argument("--json", type=Path, help="file for all figures")
     parser.add_argument("--keep", type=Path, help="folder in which images and results stay")
@@ -102,7 +127,9 @@ def bench_rigs(arguments: Sequence[str] = ()) -> None:
     chosen = parser.parse_args(arguments)
     outcomes = []
     for number in chosen.only or range(chosen.rigs):
-        outcome = run_rig(draw(chosen.seed, number), chosen.keep, not chosen.without_volumes)
+        rig = draw(chosen.seed, number)
+        rig = hardened(rig, chosen.seed) if chosen.hard else rig
+        outcome = run_rig(rig, chosen.keep, not chosen.without_volumes)
         outcomes.append(outcome)
         print(row(outcome), flush=True)
         if chosen.json:
@@ -118,7 +145,7 @@ def as_tree(outcome: Outcome) -> dict[str, Any]:
 
 def run_rig(rig: DrawnRig, keep: Path | None = None, volumes: bool = True) -> Outcome:
     """Return what comes of a rig's experiment."""
-    outcome = Outcome(rig.number, rig.name(), rig.wrong)
+    outcome = Outcome(rig.number, rig.name(), rig.wrong, rig.hard)
     began = time.perf_counter()
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary) if keep is None else keep / f"rig_{rig.number:03d}"
@@ -141,8 +168,10 @@ def experiment(rig: DrawnRig, folder: Path, outcome: Outcome, volumes: bool) -> 
         if step.exit_code:
             outcome.steps.append(step)
             return
+    if rig.haze:
+        veil(images, rig)
     soil(images, rig)
-    truth = truth_of(load_rig(true), images)
+    truth = truth_of(load_rig(true), images, load_rig(reported).grid())
 
     def done(*arguments: object) -> bool:
         outcome.steps.append(run_command(*arguments))
@@ -153,6 +182,7 @@ def experiment(rig: DrawnRig, folder: Path, outcome: Outcome, volumes: bool) -> 
     calibration, weights = folder / "calibration.h5", folder / "weights.h5"
     if not done("calibrate-snapshot", reported, "--white", images / "white.tif", *dark, *board, "-o", calibration):
         return
+    outcome.figures |= judge_calibration(rig, calibration)
     if not done("build-weights", reported, "--calibration", calibration, "-o", weights):
         return
     pair = (images / "pair_a.tif", images / "pair_b.tif")
@@ -187,6 +217,13 @@ def run_command(*arguments: object) -> Step:
     return Step(name, code, error, said, seconds)
 
 
+def codes(steps: Sequence[Step]) -> list[str]:
+    """Return the codes of what was warned of, each once; a warning that has none as it is."""
+    texts = [text for step in steps for text in step.warnings]
+    found = (re.search(r"\[([a-z-]+)\]$", text) for text in texts)
+    return list(dict.fromkeys(match.group(1) if match else text for match, text in zip(found, texts, strict=True)))
+
+
 def photograph_white(config: Path, images: Path) -> None:
     """Write a white and a dark image, as `simulate white` does in ten times as long."""
     settings = load_rig(config)
@@ -196,6 +233,21 @@ def photograph_white(config: Path, images: Path) -> None:
     images.mkdir(exist_ok=True)
     write_tiff(images / "white.tif", readout.record(light, rng), overwrite=True)
     write_tiff(images / "dark.tif", readout.record(np.zeros_like(light), rng), overwrite=True)
+
+
+def veil(images: Path, rig: DrawnRig) -> None:
+    """Add haze to the tracers' images: light of the white image's shape that fades to a half across the sensor."""
+    scene, sensor = rig.true["simulation"], rig.true["camera"]["sensor"]
+    rng = np.random.default_rng([scene["seed"], 2])
+    shape = (sensor["rows"], sensor["columns"])
+    dark, white = (read_image(images / f"{name}.tif", shape=shape).astype(np.float64) for name in ("dark", "white"))
+    lit = np.maximum(white - dark, 0.0)
+    haze = rig.haze * lit / np.quantile(lit, 0.99) * np.linspace(1.0, 0.5, shape[1])
+    for name in ("pair_a", "pair_b"):
+        photons = rng.poisson(haze * scene["photons_per_count"]) / scene["photons_per_count"]
+        image = read_image(images / f"{name}.tif", shape=shape) + photons
+        full = 2.0 ** scene["bits"] - 1.0
+        write_tiff(images / f"{name}.tif", np.minimum(np.rint(image), full).astype(np.uint16), overwrite=True)
 
 
 def soil(images: Path, rig: DrawnRig) -> None:
@@ -219,6 +271,9 @@ def soil(images: Path, rig: DrawnRig) -> None:
 def faults(figures: Figures) -> list[str]:
     """Return what is wrong with the particles and their tracks."""
     wrong = []
+    off = abs(figures.get("magnification_off", 0.0))
+    if off > max(WRONG_MAGNIFICATION, WRONG_SIGMAS * figures.get("magnification_sigma", 0.0)):
+        wrong.append(f"magnification {100.0 * figures['magnification_off']:+.2f} %")
     if figures.get("bright", 0.0) >= BRIGHT_SHARE and figures.get("recall", 1.0) < SMALLEST_RECALL:
         wrong.append(f"recall {figures['recall']:.2f}")
     for name in "uvw":
@@ -281,7 +336,9 @@ def summary(outcomes: Sequence[Outcome]) -> str:
     """Return how many rigs came to what, and which ones were wrong without a word."""
     count = Counter(outcome.verdict for outcome in outcomes)
     verdicts = ", ".join(f"{count[name]} {name}" for name in ("worked", "refused", "failed", "warned", "silent"))
-    lines = [f"{len(outcomes)} rigs: {verdicts}"]
+    right = [each for each in outcomes if each.verdict == "worked" and not each.wrong_value and not each.hard]
+    alarms = [each for each in right if set(codes(each.steps)) - ADVICE]
+    lines = [f"{len(outcomes)} rigs: {verdicts}", f"{len(right)} worked with nothing wrong: {len(alarms)} warned"]
     for name in ("refused", "failed"):
         lines.extend(f"{name}: rig {each.number}: {each.error}" for each in outcomes if each.verdict == name)
     for each in outcomes:

@@ -19,11 +19,11 @@ from benchmarks.batches import Figures, digests, killed, print_throughput, print
 from benchmarks.calibration import report, run_series
 from benchmarks.correlation import accuracy_series, against_openpiv, openpiv_pass, time_and_memory
 from benchmarks.depth import CAMERA, LATERAL_MM, Case, response
-from benchmarks.faults import ADVICE, FAULTS, STAGES, Bench, Experiment, benches, codes, prepare, told_by
+from benchmarks.faults import FAULTS, STAGES, Bench, Experiment, benches, prepare, told_by
 from benchmarks.fuzz import READERS, Reader, bench_fuzz, case, meant, outcome
 from benchmarks.particles import calibrated, errors_over_bound, print_errors_over_bound, print_figures
-from benchmarks.rig_drawing import draw
-from benchmarks.rigs import Outcome, Step, row, run_rig, summary, verdict
+from benchmarks.rig_drawing import draw, hardened
+from benchmarks.rigs import ADVICE, Outcome, Step, codes, row, run_rig, summary, verdict
 from benchmarks.sequences import print_sequence
 from benchmarks.solvers import SparseOperator, against_sparse_matrix, catching_up
 from benchmarks.surfaces import rates
@@ -186,12 +186,22 @@ def test_rigs_are_drawn_alike_and_from_the_whole_range() -> None:
     assert {rig.true["camera"]["microlenses"]["layout"] for rig in rigs} == {"square", "hexagonal"}
     assert {rig.true["media"]["fluid"] for rig in rigs} == {1.0, 1.33, 1.47}
     assert 0.1 < np.mean([rig.wrong != "" for rig in rigs]) < 0.35
+    hard = [hardened(rig, SEED) for rig in rigs]
+    assert hardened(rigs[7], SEED) == hard[7]
+    assert {name for rig in hard for name in rig.hard} == {"board", "haze", "falloff", "reach", "outside"}
+    assert {bool(rig.haze) == ("haze" in rig.hard) for rig in hard} == {True}
 
 
 @pytest.mark.parametrize("number", range(12))
 def test_configs_of_drawn_rigs_are_accepted(number: int, tmp_path: Path) -> None:
     rig = draw(SEED, number)
-    for name, tree in (("true", rig.true), ("told", rig.reported)):
+    hard = hardened(rig, SEED)
+    for name, tree in (
+        ("true", rig.true),
+        ("told", rig.reported),
+        ("hard", hard.true),
+        ("told_of_hard", hard.reported),
+    ):
         path = tmp_path / f"{name}.yaml"
         path.write_text(json.dumps(tree))
         load_rig(path)
@@ -199,7 +209,7 @@ def test_configs_of_drawn_rigs_are_accepted(number: int, tmp_path: Path) -> None
 
 
 def outcome_of(figures: dict[str, float], *steps: Step) -> Outcome:
-    outcome = Outcome(1, "a rig", "", list(steps), figures)
+    outcome = Outcome(1, "a rig", "", steps=list(steps), figures=figures)
     outcome.faults = rigs.faults(figures)
     outcome.verdict = verdict(outcome)
     return outcome
@@ -212,6 +222,9 @@ def test_verdicts_and_their_summary() -> None:
     for change in ({"recall": 0.4}, {"slope_u": 1.03}, {"coverage_x": 0.7}, {"tracks": 9.0}):
         assert outcome_of(fine | change, done).verdict == "silent"
         assert outcome_of(fine | change, Step("track", 0, "", ["lfpiv: few"], 1.0)).verdict == "warned"
+    off = {"magnification_off": -0.004, "magnification_sigma": 0.001}
+    assert outcome_of(fine | off, done).faults == ["magnification -0.40 %"]
+    assert outcome_of(fine | off | {"magnification_sigma": 0.002}, done).verdict == "worked"
     # Not sure enough to call it wrong; faint tracers need not be found; of few, coverage says nothing.
     for change in ({"slope_u": 1.03, "slope_u_sigma": 0.01}, {"recall": 0.4, "bright": 0.1}):
         assert outcome_of(fine | change, done).verdict == "worked"
@@ -224,6 +237,8 @@ def test_verdicts_and_their_summary() -> None:
     text = summary([silent, outcome_of({}, Step("build-weights", 3, "there is no room", [], 1.0))])
     assert "2 rigs: 0 worked, 1 refused, 0 failed, 0 warned, 1 silent" in text
     assert "silent: rig 1: recall 0.10" in text
+    alarm = outcome_of(fine, Step("track", 0, "", ["lfpiv: odd [wrong-links]", "lfpiv: few [few-tracers]"], 1.0))
+    assert "2 worked with nothing wrong: 1 warned" in summary([alarm, outcome_of(fine, done)])
     assert "there is no room" in text
 
 
