@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from lfpiv_cli.errors import InputError, UsageError
 from lfpiv_cli.files import listing, shares
-from lfpiv_cli.files.listing import LOOK_S, SETTLED_S, as_they_come
+from lfpiv_cli.files.listing import LOOK_S, PASSED_OVER_S, SETTLED_S, as_they_come
 from lfpiv_cli.files.shares import Deadline, Runs, Shard, parse_time_limit
 from lfpiv_cli.threads import blocks, in_threads, share_out
 
@@ -210,3 +210,12 @@ def test_nothing_more_is_begun_after_an_error() -> None:
     with pytest.raises(ZeroDivisionError):
         in_threads(work, range(50))
     assert len(begun) < 25
+
+
+def test_a_file_that_stays_broken_is_passed_over_and_taken_when_it_is_whole(recorder: Recorder) -> None:
+    recorder.plan = [(0.0, "1", WHOLE[:5]), (0.0, "2", WHOLE), (PASSED_OVER_S + 8.0, "1", WHOLE[5:])]
+    recorder.write()
+    told: list[str] = []
+    groups = as_they_come(recorder.listed, read, 15.0, lambda path, error: told.append(f"{path.name}, {error}"))
+    assert [[path.name for path in group] for group in groups] == [["2"], ["1"]]
+    assert told == [f"1, {recorder.folder / '1'}: is cut"]

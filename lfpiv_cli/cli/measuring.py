@@ -197,7 +197,7 @@ def parse_windows(text: str) -> tuple[int | tuple[int, ...], ...]:
     help="File of the pairs' mean and fluctuations to write (.vtkhdf); of vectors or tracks that are there, too.",
 )
 @batch_options
-@watch_options
+@watch_options("60")
 @output_option("File for one pair, folder for several.", required=False)
 @common_options
 @calls("correlate.correlate_files", "CorrelateOptions", "volumes", "output")
@@ -268,6 +268,7 @@ def named_images(command: Callable[..., Any]) -> Callable[..., Any]:
 )
 @work_options
 @click.option("--report/--no-report", default=True, help="Make OUTPUT/report.html, a page of all of it.")
+@watch_options("by Ctrl-C when not given")
 @output_option("Folder for all that is made.")
 @common_options
 @raw_option
@@ -293,6 +294,8 @@ def run() -> None:
     a third of its pairs, as a job of its own, that stops before the limit of the job:
              lfpiv run rig.yaml images --pairing ab --white white.tif --dark dark.tif --board board.tif \\
                  --shard 2/3 --time-limit 50m -o results
+    at the camera, each pair as it is written: a line for it, and OUTPUT/latest.html for the browser:
+             lfpiv run rig.yaml --watch images --white white.tif --dark dark.tif --board board.tif -o results
     """
 
 
@@ -319,7 +322,7 @@ def run() -> None:
     "not given.",
 )
 @batch_options
-@watch_options
+@watch_options("60")
 @output_option("File for one image, folder for several.")
 @common_options
 @raw_option

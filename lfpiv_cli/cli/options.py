@@ -142,11 +142,12 @@ def parsed_by(parse: Callable[[Any], Any]) -> Callable[[click.Context, click.Par
     return lambda _context, _option, text: None if text is None else parse(text)
 
 
-def watch_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Give a command the options of folders that are still being filled."""
+def watch_options(unless: str) -> Callable[..., Any]:
+    """Return the options of folders that are still being filled; `unless` is when they end if that is not given."""
     help_text = "The folders given are still being filled: take files as they become complete, in order."
-    idle = click.option("--idle-s", type=POSITIVE, help="With --watch, end so long after the last change; 60.")
-    return click.option("--watch", is_flag=True, help=help_text)(idle(command))
+    idle = click.option("--idle-s", type=POSITIVE, help=f"With --watch, end so long after the last change; {unless}.")
+    watch = click.option("--watch", is_flag=True, help=help_text)
+    return lambda command: watch(idle(command))
 
 
 def raw_option(command: Callable[..., Any]) -> Callable[..., Any]:

@@ -76,25 +76,32 @@ def _read(listed: Path) -> dict[Path, str]:
 # A file is complete when it can be read and has not grown for so long: cameras write a frame at once, or page by page.
 SETTLED_S = 2.0
 LOOK_S = 0.5
+# One that cannot be read holds up those behind it for so long; complete later, it is taken then.
+PASSED_OVER_S = 10.0
 
 # Size and time of change of a file.
 State = tuple[int, int]
 
 
 def as_they_come(
-    listed: Callable[[], Sequence[Path]], read: Callable[[Path], object], idle_s: float
+    listed: Callable[[], Sequence[Path]],
+    read: Callable[[Path], object],
+    idle_s: float,
+    passed_over: Callable[[Path, InputError], None] = lambda _path, _error: None,
 ) -> Iterator[list[Path]]:
     """Yield the files that are complete, in groups, until nothing has changed for `idle_s` seconds.
 
-    The order is that of the list: a file waits for those before it. One that is there after the idle time and still
-    cannot be read comes in the last group, for whoever takes it to say what it lacks.
+    The order is that of the list: a file waits for those before it, but for such as stay unreadable. One that is there
+    after the idle time and still cannot be read comes in the last group, for whoever takes it to say what it lacks.
 
     Parameters
     ----------
     listed : returns the files that are there now, in order
     read : raises `InputError` where a file cannot be read yet
+    passed_over : is told once of each file that is waited for no longer, and why
     """
     taken: set[Path] = set()
+    passed: set[Path] = set()
     # Since when each file that was not taken is as it is.
     waiting: dict[Path, tuple[State, float]] = {}
     changed_at = time.monotonic()
@@ -115,8 +122,13 @@ def as_they_come(
                 break
             try:
                 read(path)
-            except InputError:
-                break
+            except InputError as error:
+                if now - since < PASSED_OVER_S:
+                    break
+                if path not in passed:
+                    passed.add(path)
+                    passed_over(path, error)
+                continue
             ready.append(path)
         if ready:
             taken.update(ready)

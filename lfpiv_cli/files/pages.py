@@ -92,13 +92,14 @@ class Section:
 
 @dataclass(frozen=True)
 class Page:
-    """A page: its first words and tables, its sections, and the line at its foot."""
+    """A page: first words and tables, sections, the line at the foot; how often a browser reads it anew, if it does."""
 
     title: str
     text: tuple[str, ...]
     tables: tuple[Table, ...]
     sections: tuple[Section, ...]
     foot: str
+    reload_s: int | None = None
 
 
 def ensure_pages() -> None:

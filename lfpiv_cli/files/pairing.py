@@ -149,13 +149,14 @@ class _Found:
         return Pairs(tuple(self.pairs), tuple(self.left_out), tuple(self.notices), how == "ab")
 
 
-def pair_frames(frames: Sequence[Seen], how: Pairing, by: str | None = None) -> Pairs:
+def pair_frames(frames: Sequence[Seen], how: Pairing, by: str | None = None, coming: bool = False) -> Pairs:
     """Return which frames belong together; pages of one file belong together by their numbers.
 
     Parameters
     ----------
     how : `ab` for separate pairs, `sequence` for each frame with the next
     by : how names tell it, as `img_{pair}_{frame}`, see `places_by`; None: as cameras usually name frames
+    coming : more frames are to come, so that the first two running numbers say where pairs begin
 
     Raises
     ------
@@ -187,7 +188,10 @@ def pair_frames(frames: Sequence[Seen], how: Pairing, by: str | None = None) -> 
     placed = {number: place for number, place in zip(once, places, strict=True) if place is not None}
     missed = NO_PLACE if by is None else f"its name is not of the form {by}"
     found.leave_out((number for number in once if number not in placed), missed)
-    (_pair if how == "ab" else _follow)(placed, found)
+    if how == "ab":
+        _pair(placed, found, coming)
+    else:
+        _follow(placed, found)
     return found.reported(how)
 
 
@@ -239,7 +243,7 @@ def _places(frames: Sequence[Seen], how: Pairing, by: str | None) -> list[Place 
     ]
 
 
-def _pair(places: Mapping[int, Place], found: _Found) -> None:
+def _pair(places: Mapping[int, Place], found: _Found, coming: bool) -> None:
     """Find separate pairs."""
     numbered = _by_series({number: place for number, place in places.items() if place.frame is None})
     slots: dict[tuple[str, int], dict[int, list[int]]] = defaultdict(lambda: {0: [], 1: []})
@@ -255,7 +259,7 @@ def _pair(places: Mapping[int, Place], found: _Found) -> None:
                 "first and second of a pair"
             )
         elif begins is None:
-            begins = _beginning([places[k].number for k in members])
+            begins = _beginning([places[k].number for k in (members[:2] if coming else members)])
         if isinstance(begins, str):
             found.leave_out(members, begins)
             continue

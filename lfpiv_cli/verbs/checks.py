@@ -22,7 +22,15 @@ from lfpiv_cli.files.atomic import without_nan
 from lfpiv_cli.files.particle_file import PointRows
 from lfpiv_cli.files.provenance import calibrated_with
 from lfpiv_cli.files.vtkhdf import Volume, open_vectors
-from lfpiv_cli.flow.field import MASKED, REJECTED, VALID, VectorField, difference_over_stated, divergence_over_stated
+from lfpiv_cli.flow.field import (
+    MASKED,
+    MM_TO_M,
+    REJECTED,
+    VALID,
+    VectorField,
+    difference_over_stated,
+    divergence_over_stated,
+)
 from lfpiv_cli.flow.sums import margins, valid_shares
 from lfpiv_cli.flow.windows import CorrelationSettings, WindowLayout
 from lfpiv_cli.notice import Notice, written
@@ -136,6 +144,18 @@ def figures_of(fields: Mapping[str, Sequence[Path]]) -> dict[str, dict[str, floa
         for name, value in figures.items():
             reported.setdefault(name, {})[method] = value
     return reported
+
+
+def velocity_of(field: VectorField) -> tuple[Floats, Floats]:
+    """Return the mean velocity (3,) of the valid vectors of a field and the median stated error of one, m/s.
+
+    NaN where there are none, or no time is known.
+    """
+    valid = field.flag == VALID
+    if field.dt_s is None or not valid.any():
+        return np.full(3, np.nan), np.full(3, np.nan)
+    scale = np.asarray(field.voxel_mm) * MM_TO_M / field.dt_s
+    return field.velocity[valid].mean(axis=0), scale * quality_of(field).sigma[0]
 
 
 def field_notices(quality: Quality, name: str) -> Iterator[Notice]:

@@ -17,7 +17,7 @@ from lfpiv_cli.console import CONSOLE, Console, Frames
 from lfpiv_cli.errors import InputError, LfpivError, UsageError
 from lfpiv_cli.files import provenance, vtkhdf
 from lfpiv_cli.files.atomic import ensure_writable, folder_of
-from lfpiv_cli.files.batch import Target, output_paths
+from lfpiv_cli.files.batch import Target, output_paths, results_seen
 from lfpiv_cli.files.config import Config, carried_config, load_rig
 from lfpiv_cli.files.hdf5 import ensure_opens, fault_of
 from lfpiv_cli.files.inputs import ensure_room, given
@@ -36,7 +36,7 @@ from lfpiv_cli.verbs import checks
 from lfpiv_cli.verbs.batches import ALL, BatchOptions, Expected, Failure, Worked, dry_run, work_through
 from lfpiv_cli.verbs.fields import Mean, are_measured, arrays_of, mean_of_measured
 from lfpiv_cli.verbs.frames import dt_notices
-from lfpiv_cli.verbs.pairs import PairBatch, PairBatchOptions, coming_pairs, result_pairs, watched, work_as_they_come
+from lfpiv_cli.verbs.pairs import PairBatch, PairBatchOptions, coming_pairs, watched, work_as_they_come
 
 
 def correlate(
@@ -213,8 +213,9 @@ def _as_they_come(
         two_by_two = tuple((number, number + 1) for number in range(0, len(files), 2))
         return Correlation(files, output, options, overwrite, Pairs(two_by_two))
 
-    coming = watched(folders, "results", options, console)
-    groups = coming_pairs(coming, lambda files: result_pairs(files, options), console, left_out)
+    coming = watched(folders, "results", options, options.idle_s, console)
+    pairs = coming_pairs(coming, results_seen, options, console, left_out)
+    groups = ([path for pair in group for path in pair] for group in pairs)
     with folder_of(output / folders[0].name):
         return work_as_they_come(of_pairs, groups, options, console, left_out)
 

@@ -23,7 +23,7 @@ from lfpiv_cli.calibration import light_checks
 from lfpiv_cli.calibration.lens_light import LensImages
 from lfpiv_cli.calibration.rectification import Rectification
 from lfpiv_cli.calibration.sheet import sheet_fit
-from lfpiv_cli.errors import InputError
+from lfpiv_cli.errors import InputError, UsageError
 from lfpiv_cli.files import images as image_files
 from lfpiv_cli.files.batch import Frame
 from lfpiv_cli.files.config import Config
@@ -116,6 +116,13 @@ class ImageOptions:
     def mask_file(self) -> Path | None:
         """The mask, where it is a file."""
         return None if self.mask in (None, STILL) else Path(str(self.mask))
+
+    def ensure_one_by_one(self) -> None:
+        """Refuse what is made from all frames, of which some are still to come (UsageError)."""
+        if self.level.kind is not None or self.mask == STILL:
+            refused = f"--background {self.background}" if self.level.kind else f"--mask {STILL}"
+            why = "made from all frames, some of which have not come yet; wait for them"
+            raise UsageError(f"--watch: {refused} is {why}")
 
     def files(self, weights: Path) -> dict[str, Path]:
         """Return the files that all frames are made from by their roles."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -31,6 +32,7 @@ from lfpiv_cli.verbs.batches import (
     Made,
     Stamp,
     Worked,
+    WorkOptions,
     stamp_of,
     work_through,
 )
@@ -110,17 +112,19 @@ def failures_of(pairs: Pairs) -> list[Failure]:
 
 
 def image_pairs(frames: Sequence[Frame], options: PairOptions) -> Pairs:
-    """Return which frames of images belong together, see `_found`."""
-    return _found(images_seen(frames), options)
+    """Return which frames of images belong together, see `found_pairs`."""
+    return found_pairs(images_seen(frames), options)
 
 
 def result_pairs(paths: Sequence[Path], options: PairOptions) -> Pairs:
-    """Return which volumes or files of particles belong together, see `_found`."""
-    return _found(results_seen(paths), options)
+    """Return which volumes or files of particles belong together, see `found_pairs`."""
+    return found_pairs(results_seen(paths), options)
 
 
-def _found(frames: Sequence[Seen], options: PairOptions) -> Pairs:
+def found_pairs(frames: Sequence[Seen], options: PairOptions, coming: bool = False) -> Pairs:
     """Return which frames belong together: by a list, by names; without options two as they are given.
+
+    With `coming`, more frames are to come.
 
     Raises
     ------
@@ -131,7 +135,7 @@ def _found(frames: Sequence[Seen], options: PairOptions) -> Pairs:
             raise UsageError("--pairs lists separate pairs: give it without --pairing sequence and --pair-by")
         return pairs_listed(options.pairs, frames)
     if options.are_told:
-        return pair_frames(frames, options.pairing or "ab", options.pair_by)
+        return pair_frames(frames, options.pairing or "ab", options.pair_by, coming)
     if len(frames) < 2:
         raise UsageError(f"pairs need two or more frames, got {len(frames)} frames")
     if len(frames) > 2:
@@ -159,24 +163,30 @@ def doubts(frames: Sequence[Seen]) -> list[Notice]:
 
 
 OfBatch = TypeVar("OfBatch", bound=Batch)
+Item = TypeVar("Item")
+# So many that have come without a single pair among them are told.
+MOST_ALONE = 4
+PASSED_OVER = "it is passed over; its pair is measured when it is complete"
 
 
-def watched(folders: Sequence[Path], kind: InputKind, options: BatchOptions, console: Console) -> Iterator[list[Path]]:
-    """Yield the files of folders in groups, as they become complete: see `as_they_come`.
+def watched(
+    folders: Sequence[Path], kind: InputKind, options: WorkOptions, idle_s: float, console: Console
+) -> Iterator[list[Path]]:
+    """Return the files of folders in groups, as they become complete: see `as_they_come`.
 
     Raises
     ------
     UsageError : one is no folder, or a share is asked for
-    InputError : none has come
-    StoppedEarlyError : the time is over
+    InputError : none has come by the end
+    StoppedEarlyError : the time is over, as is seen between groups
     """
     if options.shard != ALL:
         raise UsageError("--watch: which frames make a share is known when the last one is there; leave out --shard")
     if options.dry_run:
         raise UsageError("--watch waits for what is not there, and --dry-run tells what is: leave out one of them")
-    for folder in folders:
+    for folder in folders or ("",):
         if not os.path.isdir(folder):
-            raise UsageError(f"{folder}: --watch takes folders")
+            raise UsageError(f"{folder or 'no folder was given'}: --watch takes folders")
 
     def read(path: Path) -> None:
         if kind == "images":
@@ -185,19 +195,28 @@ def watched(folders: Sequence[Path], kind: InputKind, options: BatchOptions, con
         else:
             vtkhdf.read_header(path)
 
-    deadline, count = options.deadline(), 0
-    console.say(f"watches {', '.join(map(str, folders))}; ends {options.idle_s:g} s after the last change")
+    def passed_over(path: Path, error: InputError) -> None:
+        console.warn([Notice("frame-failed", path.stem, f"cannot be read so far: {error}", PASSED_OVER)])
 
-    def listed() -> list[Path]:
-        if not deadline.leaves_time():
-            raise deadline.error(count, count, "frame")
-        return [path for folder in folders for path in files_in(folder, kind)]
+    deadline = options.deadline()
 
-    for group in as_they_come(listed, read, options.idle_s):
-        count += len(group)
-        yield group
-    if count == 0:
-        raise InputError(f"{folders[0]}: no {kind} have come in {options.idle_s:g} s")
+    def groups() -> Iterator[list[Path]]:
+        count = 0
+        ends = "until it is interrupted" if math.isinf(idle_s) else f"ends {idle_s:g} s after the last change"
+        console.say(f"watches {', '.join(map(str, folders))}; {ends}")
+
+        def listed() -> list[Path]:
+            if not deadline.leaves_time():
+                raise deadline.error(count, count, "frame")
+            return [path for folder in folders for path in files_in(folder, kind)]
+
+        for group in as_they_come(listed, read, idle_s, passed_over):
+            count += len(group)
+            yield group
+        if count == 0:
+            raise InputError(f"{folders[0]}: no {kind} have come in {idle_s:g} s")
+
+    return groups()
 
 
 def work_as_they_come(
@@ -238,36 +257,42 @@ def work_as_they_come(
 
 
 def coming_pairs(
-    coming: Iterable[Sequence[Path]], pair: Callable[[Sequence[Path]], Pairs], console: Console, left_out: list[Failure]
-) -> Iterator[list[Path]]:
-    """Yield the files of pairs that are complete, two by two, as they come.
+    coming: Iterable[Sequence[Item]],
+    seen_of: Callable[[Sequence[Item]], Sequence[Seen]],
+    options: PairOptions,
+    console: Console,
+    left_out: list[Failure],
+) -> Iterator[list[tuple[Item, Item]]]:
+    """Yield pairs that are complete, of frames or files as they come.
 
     Parameters
     ----------
-    pair : tells which of some files are pairs
-    left_out : is kept at the files of which no partner has come so far
+    seen_of : tells what is known of some of them
+    left_out : is kept at those of which no partner has come so far
     """
-    seen: list[Path] = []
+    items: list[Item] = []
     made: set[tuple[int, int]] = set()
     reported: set[Notice] = set()
-    for files in coming:
-        seen += files
-        if len(seen) < 2:
-            left_out[:] = [Failure(str(seen[0]), "no other frame has come")]
+    for more in coming:
+        items += more
+        seen = seen_of(items)
+        if len(items) < 2:
+            left_out[:] = [Failure(each.name, "no other frame has come") for each in seen]
             continue
-        found = pair(seen)
+        found = found_pairs(seen, options, coming=True)
         fresh = [each for each in found.pairs if each not in made]
         made.update(fresh)
         left_out[:] = failures_of(found)
-        # Once: what is taken for granted, and files that have no partner though later pairs are complete.
-        last = max((second for _, second in made), default=0)
-        before = {str(path) for path in seen[:last]}
-        passed = [*found.notices, *(each for each in found.left_out if each.about in before)]
-        unsaid = [notice for notice in passed if notice not in reported]
+        # Once: what is taken for granted, and what has no partner though later pairs are complete, or none is at all.
+        last = max((second for _, second in made), default=0 if len(items) < MOST_ALONE else len(items))
+        before = {each.name for each in seen[:last]}
+        passed = [replace(each, remedy=PASSED_OVER) for each in found.left_out if each.about in before]
+        unsaid = [notice for notice in (*found.notices, *passed) if notice not in reported]
+        unsaid = unsaid if made else [] if reported else unsaid[:1]
         reported.update(unsaid)
         console.warn(unsaid)
         if fresh:
-            yield [seen[number] for numbers in fresh for number in numbers]
+            yield [(items[first], items[second]) for first, second in fresh]
 
 
 # Pairs whose volumes or particles are dropped as soon as their vectors stand.

@@ -7,11 +7,12 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.errors import ConfigError, InputError
 from lfpiv_cli.files.batch import Frame as ImageFrame
 from lfpiv_cli.files.config import Config, carried_config
@@ -26,7 +27,7 @@ from lfpiv_cli.optics.curved_space import CurvedSpace
 from lfpiv_cli.optics.line_responses import USUAL_DIFFUSION_PX
 from lfpiv_cli.optics.tracing import ObjectSpace
 from lfpiv_cli.particles.counting import tracers_per_lens as counted
-from lfpiv_cli.particles.diameter import UNKNOWN_LENSES, Diameter, diameter_by
+from lfpiv_cli.particles.diameter import ENOUGH, UNKNOWN_LENSES, Diameter, diameter_by
 from lfpiv_cli.particles.microlens_focus import FocalLength, focal_length_of
 from lfpiv_cli.particles.neighbour_frames import second_frame, second_pass
 from lfpiv_cli.particles.rounds import ROUNDS, first_pass
@@ -164,8 +165,30 @@ def frame_of(bench: Bench, raw: Image, lit: Image) -> Frame:
     return Frame(filled(lit, unusable), unusable, bench.sums_without(bench.content.weights.padded, excluded))
 
 
-def sized(bench: Bench, frames: Iterable[Frame]) -> tuple[Bench, TracerSize]:
-    """Return the bench with the tracers' diameter, from the first of its frames where it is not given.
+class Sized(NamedTuple):
+    """The tracers' size; its covariance with diffusion where that is measured; whether enough tracers have told it."""
+
+    size: TracerSize
+    covariance: Floats | None
+    is_certain: bool
+
+    def on(self, bench: Bench) -> Bench:
+        """Return the bench with this size."""
+        diffusion, keys = self.size.diffusion, {"particle_diameter_mm": self.size.diameter_mm}
+        if diffusion is not None:
+            keys["diffusion_px"] = diffusion.px
+        settings = bench.settings.overridden("reconstruction", **keys)
+        return replace(bench, settings=settings, light_covariance=self.covariance)
+
+
+def sized(bench: Bench, frames: Iterable[Frame], known: Sized | None = None) -> tuple[Bench, TracerSize]:
+    """Return the bench with the tracers' size, and that: as it is known, or by its frames."""
+    found = known or size_of(bench, frames)
+    return found.on(bench), found.size
+
+
+def size_of(bench: Bench, frames: Iterable[Frame]) -> Sized:
+    """Return the tracers' diameter, from the first of its frames where it is not given.
 
     By waves with the sensor's charge diffusion.
     """
@@ -178,14 +201,8 @@ def sized(bench: Bench, frames: Iterable[Frame]) -> tuple[Bench, TracerSize]:
     if found is not None:
         single = (_size_of(each, given, given_px, lens_mm, size.diffusion is not None) for each in found.frames)
         size = replace(size, frames=tuple(single))
-    if size.diffusion is None:
-        settings, covariance = bench.settings.overridden("reconstruction", particle_diameter_mm=size.diameter_mm), None
-    else:
-        settings = bench.settings.overridden(
-            "reconstruction", particle_diameter_mm=size.diameter_mm, diffusion_px=size.diffusion.px
-        )
-        covariance = None if found is None or found.held is None else found.held.covariance
-    return replace(bench, settings=settings, light_covariance=covariance), size
+    held = None if found is None or size.diffusion is None else found.held
+    return Sized(size, None if held is None else held.covariance, found is not None and found.tracers >= ENOUGH)
 
 
 def _size_of(
@@ -422,13 +439,19 @@ class Finder:
 
 
 class Prepared:
-    """Opens weights once, as long as their file stays as it is: of full size that takes as long as some frames."""
+    """Opens weights once, as long as their file stays as it is: of full size that takes as long as some frames.
+
+    Attributes
+    ----------
+    size : of the tracers in all frames to come, where it is known before these are
+    """
 
     def __init__(self) -> None:
         """Begin with nothing."""
         self._opened = lru_cache(maxsize=1)(lambda path, _size, _modified_ns: open_weights_that_fit(path))
         self._searchable: tuple[WeightsFile, WeightsFile] | None = None
         self._bench: Bench | None = None
+        self.size: Sized | None = None
 
     def weights(self, path: Path) -> WeightsFile:
         """Return the weights of a file.

@@ -35,7 +35,6 @@ from lfpiv_cli.verbs import particles
 from lfpiv_cli.verbs.batches import Batch, BatchOptions, Expected, Worked, dry_run, work_through
 from lfpiv_cli.verbs.frames import (
     IMAGE,
-    STILL,
     Bench,
     ImageOptions,
     Progress,
@@ -177,16 +176,11 @@ def reconstruct_files(
     """Reconstruct the volume behind each image, or find its particles."""
     if options.watch:
         settings = carried_config(read_weights_record(weights), weights).overridden_by("reconstruction", options)
-        refused = None
-        if options.level.kind is not None:
-            refused = f"--background {options.background} is"
-        elif options.mask == STILL:
-            refused = f"--mask {STILL} is"
-        elif settings.reconstruction.solver == "particles":
-            refused = "the tracers' size, which --solver particles needs, is"
-        if refused is not None:
-            raise UsageError(f"--watch: {refused} made from all frames, some of which have not come yet; wait for them")
-        groups = watched(images, "images", options, console)
+        if settings.reconstruction.solver == "particles":
+            why = "the tracers' size, which --solver particles needs, is measured first"
+            raise UsageError(f"--watch: {why}; run --watch does so")
+        options.ensure_one_by_one()
+        groups = watched(images, "images", options, options.idle_s, console)
         with folder_of(output / weights.name):
             batch, worked = work_as_they_come(
                 lambda group: Reconstruction(weights, group, output, options, overwrite), groups, options, console
@@ -249,8 +243,8 @@ class Reconstruction(Batch[Outcome]):
         self.notices = [] if pairs is None else pairs.settled(options.keep_going)
         self._beside = None if pairs is None else pairs.beside(len(frames))
         self._first_of = {} if pairs is None else pairs.first_of()
-        every = list(range(len(frames))) if pairs is None else pairs.order(len(frames))
-        self.order = every if order is None else order
+        self._every = list(range(len(frames))) if pairs is None else pairs.order(len(frames))
+        self.order = self._every if order is None else order
         self.names = [frame.stem for frame in frames]
         self._paths = output_paths(output, self.names)
         self._gone = {} if weights_to_come is None else {weights: weights_to_come}
@@ -316,8 +310,9 @@ class Reconstruction(Batch[Outcome]):
         size, said = None, []
         if self._as_particles:
             # What cannot be read is told where its turn comes.
-            pictures = readable(read, range(len(frames)), keep_going=True)
-            bench, size = particles.sized(bench, (particles.frame_of(bench, *each) for each in pictures))
+            pictures = readable(read, self._every, keep_going=True)
+            seen = (particles.frame_of(bench, *each) for each in pictures)
+            bench, size = particles.sized(bench, seen, prepared.size)
             said = size_notices(settings, size)
             console.warn(said)
         finder = Finder(bench, read, frames, self._beside, self._first_of, options.keep_going)

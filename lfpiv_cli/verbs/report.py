@@ -135,27 +135,15 @@ def report(
     fields = {path: open_vectors(path) for path in contents.of("vectors")[:LONGEST_TABLE]}
     # Those with the smallest stated errors first.
     fields = dict(sorted(fields.items(), key=lambda item: _sigma(item[1])))
-    reasons = [*checks.of_warnings(contents.all_records), *_of_all_vectors(contents, fields)]
-    made_by = {checks.verb_of(record) for record in contents.all_records.values()}
-    counted: list[tuple[checks.Part, bool, str]] = [
-        (
-            "calibration",
-            not made_by.isdisjoint(checks.CALIBRATES),
-            "no calibration: lengths are as the data sheet has them",
-        ),
-        ("images", not made_by.isdisjoint(checks.OF_IMAGES), "no volumes and no particles"),
-        ("vectors", bool(contents.of("vectors") or contents.of("tracks")), "no vectors and no tracks"),
-    ]
-    reasons += [checks.Line(part, "look", text) for part, there, text in counted if not there]
-    judged = {part: checks.worst_first(reasons, part) for part, _, _ in counted}
-    words = {part: checks.worst(lines, "good") for part, lines in judged.items()}
+    judged_parts = judged(contents, fields)
+    words = {part: checks.worst(lines, "good") for part, lines in judged_parts.items()}
     advice = "Nothing speaks against these vectors, as far as images and vectors tell it themselves."
     if "no" in words.values():
         advice = "Do not use these vectors before what is said below is mended."
     elif "look" in words.values():
         advice = "Look at what is said below before you use these vectors."
-    reported = {part: "; ".join(each.reason for each in lines) for part, lines in judged.items()}
-    rows = tuple((part, words[part], reported[part] or "nothing speaks against it") for part in judged)
+    reported = {part: "; ".join(each.reason for each in lines) for part, lines in judged_parts.items()}
+    rows = tuple((part, words[part], reported[part] or "nothing speaks against it") for part in judged_parts)
     verdict = Table("Verdict: good, look (at the reasons), or no", ("part", "verdict", "reasons"), rows)
     with TemporaryDirectory() as pictures:
         drawer = Drawer(contents, Path(pictures), {sha256(path): path for path in options.raw})
@@ -168,8 +156,25 @@ def report(
     return {"files": len(contents.records), "pictures": drawer.count, "verdict": words}
 
 
-def contents_of(folder: Path) -> Contents:
-    """Return what a folder holds, and the folders in it.
+def judged(contents: Contents, fields: Fields) -> dict[checks.Part, list[checks.Line]]:
+    """Return what speaks for and against each part of the chain, the worst first."""
+    reasons = [*checks.of_warnings(contents.all_records), *_of_all_vectors(contents, fields)]
+    made_by = {checks.verb_of(record) for record in contents.all_records.values()}
+    counted: list[tuple[checks.Part, bool, str]] = [
+        (
+            "calibration",
+            not made_by.isdisjoint(checks.CALIBRATES),
+            "no calibration: lengths are as the data sheet has them",
+        ),
+        ("images", not made_by.isdisjoint(checks.OF_IMAGES), "no volumes and no particles"),
+        ("vectors", bool(contents.of("vectors") or contents.of("tracks")), "no vectors and no tracks"),
+    ]
+    reasons += [checks.Line(part, "look", text) for part, there, text in counted if not there]
+    return {part: checks.worst_first(reasons, part) for part, _, _ in counted}
+
+
+def contents_of(folder: Path, only: Iterable[Path] | None = None) -> Contents:
+    """Return what a folder holds, and the folders in it; or `only` some of its files, as far as they are there.
 
     Raises
     ------
@@ -179,7 +184,8 @@ def contents_of(folder: Path) -> Contents:
         raise InputError(f"{folder}: is no folder of results")
     files: dict[str, list[Path]] = {}
     records: dict[str, Mapping[str, Any]] = {}
-    for path in sorted(path for path in folder.rglob("*") if path.suffix in SUFFIXES):
+    paths = folder.rglob("*") if only is None else (path for path in only if path.exists())
+    for path in sorted(path for path in paths if path.suffix in SUFFIXES):
         parts = path.relative_to(folder).parts
         if len(parts) > DEEPEST or any(part.startswith(".") for part in parts):
             continue

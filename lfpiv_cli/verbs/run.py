@@ -42,7 +42,7 @@ from lfpiv_cli.verbs.checks import figures_of
 from lfpiv_cli.verbs.correlate import field_bytes
 from lfpiv_cli.verbs.follow import SEQUENCE_IS_WHOLE, follow_particles
 from lfpiv_cli.verbs.following import SHORTEST, ensure_sequence
-from lfpiv_cli.verbs.frames import mask_of, other_frames, read_frame, reader
+from lfpiv_cli.verbs.frames import Bench, Read, mask_of, other_frames, read_frame, reader
 from lfpiv_cli.verbs.pairs import image_pairs
 from lfpiv_cli.verbs.report import ReportOptions, report
 from lfpiv_cli.verbs.run_steps import (
@@ -91,6 +91,10 @@ def run(
     PartialError : frames or pairs failed, and the others were worked on
     """
     settings = load_rig(config)
+    if options.watch:
+        from lfpiv_cli.verbs.watch import watch
+
+        return watch(config, settings, output, options, overwrite, console)
     frames, pairs = _ensure_possible(settings, options)
     console.warn(pairs.settled(options.keep_going))
     steps = Steps(output, console, earlier_run(output, overwrite), options.deadline(), options.shard == ALL)
@@ -98,25 +102,23 @@ def run(
     if not options.dry_run:
         ensure_volume_fits(settings, options.method in ("volumes", "both"))
     try:
-        return planned(chain) if options.dry_run else _made(chain)
+        return planned(chain) if options.dry_run else take_all(chain)
     except OutputExistsError as error:
         chain.overwrite = True
         raise OutputExistsError(f"{error}{with_overwrite(chain)}") from error
 
 
-def _made(chain: Chain) -> dict[str, Any]:
+def take_all(chain: Chain) -> dict[str, Any]:
     """Take all steps; return what is told of them (PartialError: something failed)."""
     steps, options, output = chain.steps, chain.options, chain.steps.output
     ensure_writable(output / RECORD, overwrite=True)
     weights = chain.weights()
     if not chain.share:
         return steps.summary()
-    choice = _chosen(chain.settings, options, lambda: _counted(chain, weights))
+    choice = chosen(chain.settings, options, lambda: counted(chain, weights))
     steps.console.say(f"by {' and '.join(choice.methods)}: {choice.reason}")
     steps.reported.update(choice.reported())
-    fields: dict[str, Vectors] = {method: chain.vectors_by(method, weights) for method in choice.methods}
-    if options.combine:
-        fields["combined"] = chain.combined(fields["volumes"], fields["particles"])
+    fields = measured(chain, choice, weights)
     figures = figures_of({method: list(paths.values()) for method, paths in fields.items()})
     steps.reported["figures"] = figures
     reported = choice.reported() | figures
@@ -149,8 +151,16 @@ def _made(chain: Chain) -> dict[str, Any]:
     return reported
 
 
-def _ensure_possible(settings: Config, options: RunOptions) -> tuple[list[Frame], Pairs]:
-    """Return the frames of the flow and their pairs, after all that can be known to be wrong has been asked for."""
+def measured(chain: Chain, choice: Choice, weights: Path) -> dict[str, Vectors]:
+    """Return the files of vectors by each method; those that err least are the last."""
+    fields: dict[str, Vectors] = {method: chain.vectors_by(method, weights) for method in choice.methods}
+    if chain.options.combine:
+        fields["combined"] = chain.combined(fields["volumes"], fields["particles"])
+    return fields
+
+
+def ensure_inputs(settings: Config, options: RunOptions) -> None:
+    """Raise where settings, photographs or outputs are wrong, as far as it is known before the images are read."""
     _ensure_settings(settings, options)
     ensure_drawing()
     if options.report:
@@ -160,6 +170,13 @@ def _ensure_possible(settings: Config, options: RunOptions) -> tuple[list[Frame]
         ensure_regular_file(split_part(path)[0])
     for path in filter(None, (options.dark, options.level.path, options.mask_file)):
         image_files.read_reference(path, settings.image_shape())
+    if options.failures is not None:
+        ensure_writable(options.failures, overwrite=True)
+
+
+def _ensure_possible(settings: Config, options: RunOptions) -> tuple[list[Frame], Pairs]:
+    """Return the frames of the flow and their pairs, after all that can be known to be wrong has been asked for."""
+    ensure_inputs(settings, options)
     frames = frames_of(options.images, options.keep_going)
     if options.follow:
         ensure_sequence(len(frames), SHORTEST)
@@ -168,8 +185,6 @@ def _ensure_possible(settings: Config, options: RunOptions) -> tuple[list[Frame]
         pairs = image_pairs(frames, options)
         pairs.settled(options.keep_going)
     output_paths(Path(), [frame.stem for frame in frames])
-    if options.failures is not None:
-        ensure_writable(options.failures, overwrite=True)
     _first_readable(frames, settings.image_shape(), options.keep_going)
     if not options.keep_going:
         for path in dict.fromkeys(frame.path for frame in frames):
@@ -232,7 +247,7 @@ def _ensure_settings(settings: Config, options: RunOptions) -> None:
         raise ConfigError(f"{settings.source}: weights.method: is dlfc, but particles are fitted with traced rays")
 
 
-def _chosen(settings: Config, options: RunOptions, count_tracers: Callable[[], float | None]) -> Choice:
+def chosen(settings: Config, options: RunOptions, count_tracers: Callable[[], float | None]) -> Choice:
     """Return by which methods the flow is measured: those asked for, or what errs less with so many tracers."""
     if settings.weights.method == "dlfc":
         return Choice(("volumes",), "weights.method is dlfc, whose fitted rays particles cannot be fitted with")
@@ -256,11 +271,12 @@ def _chosen(settings: Config, options: RunOptions, count_tracers: Callable[[], f
     return Choice((asked,), f"as asked for; but there are {reason}", count)
 
 
-def _counted(chain: Chain, weights: Path) -> float | None:
+def counted(chain: Chain, weights: Path) -> float | None:
     """Return how many tracers for each microlens the first image holds, as the run before has counted if it could."""
     settings, options, frames, steps = chain.settings, chain.options, chain.frames, chain.steps
     shape, level = settings.image_shape(), options.level
-    first = _first_readable(frames, shape, options.keep_going)
+    order = chain.pairs.order(len(frames))
+    first = order[_first_readable([frames[k] for k in order], shape, options.keep_going)]
     files = (weights, frames[first].path, *filter(None, (options.dark, level.path)))
     mask = "" if options.mask_file is None else sha256(options.mask_file)
     words = other_frames(level, frames)(first)
@@ -268,13 +284,19 @@ def _counted(chain: Chain, weights: Path) -> float | None:
     steps.reported["counted_from"] = hashlib.sha256(counted_from.encode()).hexdigest()
     if steps.earlier.get("counted_from") == steps.reported["counted_from"] and "tracers_per_lens" in steps.earlier:
         return cast("float | None", steps.earlier["tracers_per_lens"])
-    content = chain.prepared.searchable(weights, settings)
+    bench, read = bench_and_reader(chain, weights)
+    return particles.tracers_per_lens(bench, particles.frame_of(bench, *read(first)))
+
+
+def bench_and_reader(chain: Chain, weights: Path) -> tuple[Bench, Read]:
+    """Return what frames share where particles are sought in them, and what reads a frame."""
+    options, frames = chain.options, chain.frames
+    content = chain.prepared.searchable(weights, chain.settings)
     shape = content.image_shape
     dark = options.dark_image(shape)
     # What stands still would take a look at every image, and a pair hardly shows it better than one counts without.
-    bench = chain.prepared.bench(content, settings, dark, mask_of(options.mask_file, frames, shape, 0.0))
-    read = reader(level, frames, shape, dark, options.keep_going)
-    return particles.tracers_per_lens(bench, particles.frame_of(bench, *read(first)))
+    bench = chain.prepared.bench(content, chain.settings, dark, mask_of(options.mask_file, frames, shape, 0.0))
+    return bench, reader(options.level, frames, shape, dark, options.keep_going)
 
 
 def planned(chain: Chain) -> dict[str, Any]:
@@ -298,13 +320,13 @@ def planned(chain: Chain) -> dict[str, Any]:
     if before:
         return counts | _from_nothing(chain)
     weights, to_come = output / WEIGHTS, _weights_to_come(chain)
-    methods = _chosen(settings, options, lambda: _counted(chain, weights)).methods
+    methods = chosen(settings, options, lambda: counted(chain, weights)).methods
     reported: dict[str, dict[str, Any]] = {}
     for method in methods:
         if options.follow:
             # The frames of a sequence depend on the whole config.
-            chosen = replace(chain.following(dry_run=True), resume=to_come is None)
-            reported[method] = follow_particles(weights, options.images, output, chosen, **chain.common)
+            whole = replace(chain.following(dry_run=True), resume=to_come is None)
+            reported[method] = follow_particles(weights, options.images, output, whole, **chain.common)
             continue
         found = chain.reconstruction(method, weights, to_come)
         in_time = method == "particles" and not chain.pairs.separate

@@ -7,6 +7,7 @@ leaves them as they are; its summary is then the one of the run that made them.
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -183,6 +184,8 @@ class RunOptions(PairOptions, ImageOptions, WorkOptions):
     follow : find and track the particles of a time-resolved sequence together, as `follow_particles` does
     keep : `results`: volumes, and particles of separate pairs, are dropped as soon as their vectors stand
     report : make the page of all that the folder holds, too
+    watch : the images are folders that are still being filled; separate pairs are measured as they become complete
+    idle_s : such folders end when nothing in them has changed for so long
     """
 
     images: Sequence[Path]
@@ -195,6 +198,8 @@ class RunOptions(PairOptions, ImageOptions, WorkOptions):
     follow: bool = False
     keep: Kept = "all"
     report: bool = True
+    watch: bool = False
+    idle_s: float = math.inf
 
 
 CALIBRATION, WEIGHTS, PICTURE = "calibration.h5", "weights.h5", "calibration.png"
@@ -225,6 +230,7 @@ class Chain:
         pairs: Pairs,
         steps: Steps,
         overwrite: bool,
+        prepared: Prepared | None = None,
     ) -> None:
         """Take the frames and which of them belong together, and what steps share."""
         self.config, self.settings, self.options, self.frames, self.steps = config, settings, options, frames, steps
@@ -235,7 +241,7 @@ class Chain:
         self.order = list(dict.fromkeys([*(k for pair in ours for k in pair), *(alone if shard.is_last else [])]))
         # Of several shards the first one tells them.
         self.failures = failures_of(pairs) if shard.number == 1 else []
-        self.prepared, self.overwrite = Prepared(), overwrite
+        self.prepared, self.overwrite = prepared or Prepared(), overwrite
         self.pairs = replace(pairs, left_out=())
 
     @property
@@ -429,7 +435,7 @@ class Chain:
 
     def of_pairs(self, name: str) -> list[Path]:
         """Return the file of each pair, in a folder where there are several."""
-        if len(self.frames) == 2:
+        if len(self.frames) == 2 and not self.options.watch:
             return [self.steps.output / f"{name}{VTKHDF_SUFFIX}"]
         of_frames = self._of_frames(name)
         return [of_frames[first] for first, _ in self.pairs.pairs]
