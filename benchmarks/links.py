@@ -21,8 +21,6 @@ SCALE = Scale(0.1, 1.064)
 VOXEL_MM = 0.1
 DT_S = 1e-3
 SEEDS = (101, 102, 103)
-# Largest displacement that is sought, in rms of a component.
-SEARCH_RMS = 4.5
 
 
 @dataclass(frozen=True)
@@ -81,7 +79,7 @@ def shares(case: Turbulence, seed: int, with_light: bool = True) -> tuple[float,
     first, second, number_a, number_b = case.frames(seed)
     if not with_light:
         first, second = without_light(first), without_light(second)
-    links = track(first, second, SEARCH_RMS * case.rms_mm, SCALE)
+    links = track(first, second, SCALE)
     right = (number_a[links.first] == number_b[links.second]) & (number_a[links.first] >= 0)
     both = len(np.intersect1d(number_a[number_a >= 0], number_b))
     return float(right.sum() / both), float(1.0 - right.mean()), float(1.0 - links.probability.mean())

@@ -35,7 +35,6 @@ FLOWS: dict[str, Flow] = {
     "Taylor-Green": taylor_green(3.0 * VOXEL_M_S, 8.0),
     "random modes": random_modes(1.5 * VOXEL_M_S, seed=1),
 }
-SEARCH_MM = {"fast duct": 1.2}
 SHORTEST = 4
 DISTANCES_MM = ((0.0, np.inf), (0.0, 0.5), (0.5, 2.0), (2.0, np.inf))
 
@@ -53,11 +52,10 @@ def print_sequence(bench: Bench, name: str, count: int, frames: int, seed: int) 
     """Render a sequence, follow it and print a line for each range of depths."""
     images, true = photographs(bench, FLOWS[name], count, frames, np.random.default_rng(seed))
     began = time.process_time()
-    search_mm = SEARCH_MM.get(name, 0.6)
-    found, partial = followed(bench, images, search_mm)
+    found, partial = followed(bench, images)
     print_figures(f"{name}, {count}, forwards", bench, found, partial, true, time.process_time() - began)
     began = time.process_time()
-    found, partial = followed_again(bench, images, found, partial, search_mm)
+    found, partial = followed_again(bench, images, found, partial)
     print_figures(f"{name}, {count}, both ways", bench, found, partial, true, time.process_time() - began)
 
 
@@ -96,22 +94,22 @@ def photographs(
     return images, np.array(true)
 
 
-def followed(bench: Bench, images: list[NDArray[np.float32]], search_mm: float) -> tuple[list[Seen], PartialTracks]:
+def followed(bench: Bench, images: list[NDArray[np.float32]]) -> tuple[list[Seen], PartialTracks]:
     """Return the particles of each frame, and how they belong together."""
     tasks = [bench.task(image) for image in images]
     own = [first_pass(task).particles for task in tasks[:2]]
-    found = [_seen(result(tasks[k], second_pass(tasks[k], own[k], [own[1 - k]], search_mm))) for k in range(2)]
+    found = [_seen(result(tasks[k], second_pass(tasks[k], own[k], [own[1 - k]]))) for k in range(2)]
     scale = tasks[0].view.scale
-    partial = extended(begun(found), found, search_mm, scale)
+    partial = extended(begun(found), found, None, scale)
     for task in tasks[2:]:
         state = find_predicted(task, _predicted(bench, partial.ahead))
         found.append(_seen(result(task, first_pass(task) if state is None else state)))
-        partial = extended(partial, found, search_mm, scale)
+        partial = extended(partial, found, None, scale)
     return found, partial
 
 
 def followed_again(
-    bench: Bench, images: list[NDArray[np.float32]], found: list[Seen], partial: PartialTracks, search_mm: float
+    bench: Bench, images: list[NDArray[np.float32]], found: list[Seen], partial: PartialTracks
 ) -> tuple[list[Seen], PartialTracks]:
     """Return the same after a second pass, in which each frame is expected by its tracks before and after it."""
     confirmed, again = long_ones(partial.found, SHORTEST), []
@@ -121,7 +119,7 @@ def followed_again(
         again.append(_seen(result(task, first_pass(task) if state is None else state)))
     partial, scale = begun(again), bench.task(images[0]).view.scale
     while partial.last < len(again) - 1:
-        partial = extended(partial, again, search_mm, scale)
+        partial = extended(partial, again, None, scale)
     return again, partial
 
 

@@ -37,13 +37,13 @@ def test_what_a_neighbour_found_is_found(table2: Camera, water: Media, rng: np.r
     own = np.concatenate([own, [[*(0.5 * (true[0] + true[1]))[:3], true[0, 3] + true[1, 3]]]])
     ghosts = rng.uniform((-0.9, -0.7, 1.2, 4e5), (0.9, 0.7, 2.6, 6e5), (3, 4))
     before = np.concatenate([true, ghosts]) - MOVED
-    alone = second_pass(task, own, [], 0.6).particles
+    alone = second_pass(task, own, []).particles
     assert not found(alone, true)[2]
-    beside = second_pass(task, own, [before], 0.6).particles
+    beside = second_pass(task, own, [before]).particles
     assert found(beside, true).all()
     assert len(beside) == len(true)
     # Two neighbours that know the same name it once.
-    both = second_pass(task, own, [before, np.concatenate([true, ghosts]) + MOVED], 0.6).particles
+    both = second_pass(task, own, [before, np.concatenate([true, ghosts]) + MOVED]).particles
     assert found(both, true).all()
     assert len(both) == len(true)
 
@@ -99,7 +99,7 @@ def test_predictions_that_fit_nothing_are_refused(task: Task, true: NDArray[np.f
     assert find_predicted(task, predicted(true + (0.0, 0.0, 9.0, 0.0))) is None
 
 
-SEARCH_MM, SCALE = 0.6, Scale(0.1, 1.064)
+SCALE = Scale(0.1, 1.064)
 
 
 def strewn(rng: np.random.Generator, count: int = 30) -> NDArray[np.float64]:
@@ -125,16 +125,16 @@ def test_particles_are_expected_where_the_flow_takes_them_and_not_where_neighbou
     # Half of them are seen already, all of them brighter, and none of the rest is anywhere near.
     seen = (trusted[:30] + MOVED) * (1.0, 1.0, 1.0, 1.2)
     seen[:, :2] += rng.normal(0.0, 2e-4, (30, 2))
-    predicted = predicted_by(trusted, seen, SEARCH_MM, SCALE)
+    predicted = predicted_by(trusted, seen, SCALE)
     assert len(predicted.particles) == 60
     np.testing.assert_allclose(predicted.particles[:30, :3], seen[:, :3])
     np.testing.assert_allclose(predicted.particles[30:, :3], (trusted + MOVED)[30:, :3], atol=2e-3)
     np.testing.assert_allclose(predicted.particles[:, 3], 1.2 * trusted[:, 3])
     seen[:, :3] += rng.normal(0.0, (0.05, 0.05, 0.05), (30, 3))
-    assert len(predicted_by(trusted, seen, SEARCH_MM, SCALE).particles) <= 30
+    assert len(predicted_by(trusted, seen, SCALE).particles) <= 30
     nothing = np.zeros((0, 4))
     for first, second in ((trusted, nothing), (nothing, seen), (nothing, nothing)):
-        assert not len(predicted_by(first, second, SEARCH_MM, SCALE).particles)
+        assert not len(predicted_by(first, second, SCALE).particles)
 
 
 @pytest.mark.thorough
@@ -143,7 +143,7 @@ def test_the_second_frame_goes_on_from_the_first(table2: Camera, water: Media, r
     both = np.concatenate([true, new])
     before, task = (task_with(table2, water, each, rng) for each in (true - MOVED, both))
     told: list[int] = []
-    particles = second_frame(task, before, np.concatenate([true - MOVED, strewn(rng, 3)]), SEARCH_MM, told.append)
+    particles = second_frame(task, before, np.concatenate([true - MOVED, strewn(rng, 3)]), told.append)
     assert found(particles, both).all()
     assert len(particles) == 32
     assert sum(told) == STEPS
@@ -151,7 +151,7 @@ def test_the_second_frame_goes_on_from_the_first(table2: Camera, water: Media, r
     assert particles.shape != alone.shape or not np.array_equal(particles, alone)
     # Particles of another scene predict nothing: all is as without a first frame.
     told.clear()
-    np.testing.assert_array_equal(second_frame(task, before, strewn(rng), SEARCH_MM, told.append), alone)
+    np.testing.assert_array_equal(second_frame(task, before, strewn(rng), told.append), alone)
     assert sum(told) == STEPS
 
 

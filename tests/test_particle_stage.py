@@ -70,7 +70,7 @@ def test_track_writes_tracks_and_vectors(
     np.testing.assert_allclose(np.median(tracks.arrays["velocity"], axis=0), (0.1, -0.05, 0.025), atol=1e-9)
     assert tracks.reference == Reference("mid_plane", 0.5)
     # What tracking chose stands beside the config's sections.
-    assert tracks.provenance["config"]["search_mm"] > 0.0
+    assert tracks.provenance["config"]["search_mm"] is None
     assert carried_config(tracks.provenance, "tracks").resolved() == load_rig(CONFIG).resolved()
     field = vtkhdf.open_vectors(tmp_path / "tracks_grid.vtkhdf")
     assert field.flag.shape == (6, 3, 5)

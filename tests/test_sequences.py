@@ -40,15 +40,15 @@ def frames(rng: np.random.Generator) -> tuple[NDArray[np.float64], NDArray[np.fl
 def test_particles_are_followed_further_than_their_distance_and_few_without_common_ones(
     frames: tuple[NDArray[np.float64], NDArray[np.float64]], rng: np.random.Generator
 ) -> None:
-    tracks = track(*map(Seen, frames), 0.6, SCALE)
+    tracks = track(*map(Seen, frames), SCALE, 0.6)
     right = (tracks.first == tracks.second) & (tracks.first < 450)
     assert right.sum() > 0.9 * 450
     assert right.mean() > 0.98
     assert np.unique(tracks.second).size == tracks.second.size
     first, second = (Seen(points) for points in rng.uniform(0.0, BOX_MM, (2, 300, 3)))
-    assert len(track(first, second, 0.3, SCALE).first) < 60
-    assert track(Seen(np.zeros((0, 3))), Seen(np.zeros((3, 3))), 0.5, SCALE).first.size == 0
-    assert track(Seen(np.zeros((3, 3))), Seen(np.zeros((0, 3))), 0.5, SCALE).first.size == 0
+    assert len(track(first, second, SCALE, 0.3).first) < 60
+    assert track(Seen(np.zeros((0, 3))), Seen(np.zeros((3, 3))), SCALE, 0.5).first.size == 0
+    assert track(Seen(np.zeros((3, 3))), Seen(np.zeros((0, 3))), SCALE, 0.5).first.size == 0
 
 
 @pytest.mark.thorough
@@ -61,7 +61,7 @@ def test_few_particles_are_followed_among_ghosts(count: int, rng: np.random.Gene
         start, end = (each + rng.normal(0.0, NOISE_MM, each.shape) for each in (both, both + moved(both)))
         alone = rng.uniform(0.0, BOX_MM, (2, ghosts, 3))
         frames = np.concatenate([start, alone[0]]), np.concatenate([end, alone[1]])
-        links = track(*map(Seen, frames), 0.6, SCALE)
+        links = track(*map(Seen, frames), SCALE, 0.6)
         right += np.count_nonzero((links.first == links.second) & (links.first < count))
         linked += len(links.first)
     # A ghost has another within reach in one frame of forty for each particle there.
@@ -76,8 +76,8 @@ def test_a_world_of_another_size_has_the_same_links(
 ) -> None:
     some = slice(max(0, 448 - count), 452)
     first, second = frames[0][some], frames[1][some]
-    here = track(Seen(first), Seen(second), 0.6, SCALE)
-    there = track(Seen(factor * first), Seen(factor * second), factor * 0.6, Scale(factor * 0.1, factor * 1.064))
+    here = track(Seen(first), Seen(second), SCALE, 0.6)
+    there = track(Seen(factor * first), Seen(factor * second), Scale(factor * 0.1, factor * 1.064), factor * 0.6)
     np.testing.assert_array_equal(there.first, here.first)
     np.testing.assert_array_equal(there.second, here.second)
     np.testing.assert_allclose(there.probability, here.probability, atol=1e-9)
@@ -210,7 +210,7 @@ def error_over_sigma(recorded: Recorded, found: Trajectories, frames: int) -> ND
 def test_errors_fall_with_the_number_of_frames_and_tracks_go_on_over_lost_ones(
     recorded: Recorded, followed: Trajectories
 ) -> None:
-    pair = track(*recorded.seen[:2], 0.4, SCALE)
+    pair = track(*recorded.seen[:2], SCALE, 0.4)
     moved = recorded.points[1][pair.second] - recorded.points[0][pair.first]
     middle = 0.5 * (recorded.true_mm[0][pair.first] + recorded.true_mm[1][pair.second])
     spread = [np.median(np.abs(moved - FLOW(middle) * DT_S * 1e3), axis=0)]
@@ -237,7 +237,7 @@ def test_errors_fall_with_the_number_of_frames_and_tracks_go_on_over_lost_ones(
 def test_ghosts_fall_with_the_length_of_tracks() -> None:
     """As many ghosts as particles, which are known so badly that a ghost is often where one is expected."""
     crowd = record(np.random.default_rng(6), ghosts=1.0, noise=4.0)
-    pair = track(*crowd.seen[:2], 0.4, SCALE)
+    pair = track(*crowd.seen[:2], SCALE, 0.4)
     of_pair = np.mean((crowd.true_number[0][pair.first] < 0) | (crowd.true_number[1][pair.second] < 0))
     length, truth = lengths_of(crowd.follow(5, 2)), np.concatenate(crowd.true_number[:5])
     shares = [np.mean(truth[length >= shortest] < 0) for shortest in (3, 4, 5)]
@@ -265,7 +265,7 @@ def test_tracks_are_of_one_particle_each_and_their_own_past_goes_first(
     noise = rng.normal(0.0, NOISE_MM, start.shape)
     forecast = Forecast(moved + noise, np.broadcast_to(NOISE_MM, start.shape))
     for prediction, least, most in ((forecast, 0.95, 1.0), (None, 0.0, 0.5)):
-        links = track(Seen(start), Seen(start + moved), 0.8, SCALE, prediction)
+        links = track(Seen(start), Seen(start + moved), SCALE, 0.8, prediction)
         assert least * 400 <= np.sum(links.first == links.second) <= most * 400
 
 

@@ -82,7 +82,10 @@ def field() -> None:
 @inputs_argument("particles", "results")
 @dt_option
 @click.option(
-    "--search", "search_voxel", type=POSITIVE, help="Largest displacement, voxels; six microlenses when not given."
+    "--search",
+    "search_voxel",
+    type=POSITIVE,
+    help="Largest displacement, voxels; found from the particles when not given.",
 )
 @click.option(
     "--shortest",
@@ -128,7 +131,7 @@ def track() -> None:
     "--search",
     "search_voxel",
     type=POSITIVE,
-    help="Largest displacement from the first frame to the second, voxels; six microlenses when not given.",
+    help="Largest displacement from the first frame to the second, voxels; found from the particles when not given.",
 )
 @click.option(
     "--shortest", type=click.IntRange(min=2), default=4, help="Fewest frames of a track, shorter ones are ghosts; 4."

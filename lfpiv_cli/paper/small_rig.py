@@ -355,7 +355,7 @@ def displacement(points_mm: Points) -> Points:
 
 def tracks_between(first: Points, second: Points, known: Rig) -> tuple[Points, Points]:
     """Return the middles (n, 3) of a pair's tracks and their displacements (n, 3)."""
-    tracks = track(Seen(first), Seen(second), SEARCH_MM, known.camera.scale(known.media))
+    tracks = track(Seen(first), Seen(second), known.camera.scale(known.media), SEARCH_MM)
     a, b = first[tracks.first], second[tracks.second]
     return 0.5 * (a + b), b - a
 

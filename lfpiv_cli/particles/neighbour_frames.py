@@ -51,7 +51,7 @@ from lfpiv_cli.particles.search import (
 )
 from lfpiv_cli.particles.suspects import SUSPECT_CHI2, good_chi2, settled
 from lfpiv_cli.tracks.candidates import Light, Seen
-from lfpiv_cli.tracks.tracking import expected_of, known_of, track
+from lfpiv_cli.tracks.tracking import expected_of, known_of, reach_of, track
 
 # Particles of a frame whose places the frames before predict, as in Shake-The-Box, and those that the rest shows.
 #
@@ -172,20 +172,17 @@ LIGHT_SIGMA = 0.05
 SAVED_STEPS = sum(settings.iterations + 1 for settings in ROUNDS[1:]) - STEPS
 
 
-def second_frame(
-    task: Task, before: Task, particles: Floats, search_mm: float, progress: Callable[[int], None] | None = None
-) -> Floats:
+def second_frame(task: Task, before: Task, particles: Floats, progress: Callable[[int], None] | None = None) -> Floats:
     """Return the particles (n, 4) of the first pass over the second frame of a pair.
 
     Parameters
     ----------
     task, before : the second and the first image
     particles : (m, 4) what the first pass found in the first
-    search_mm : largest displacement along each axis
     """
     state = after_rounds(task, blank(task), ROUNDS[:1], progress)
     trusted = particles[beyond_doubt(before, particles)]
-    predicted = predicted_by(trusted, state.particles, search_mm, task.view.scale)
+    predicted = predicted_by(trusted, state.particles, task.view.scale)
     if len(predicted.particles) >= LEAST_EXPECTED * len(particles):
         found = find_predicted(task, predicted, progress)
         if found is not None:
@@ -203,15 +200,15 @@ def beyond_doubt(task: Task, particles: Floats) -> NDArray[np.bool_]:
     return np.asarray((fits.chi2 < SUSPECT_CHI2 * good_chi2(fits.chi2)) & (fits.share > TRUSTED_SHARE))
 
 
-def predicted_by(trusted: Floats, seen: Floats, search_mm: float, scale: Scale) -> Predicted:
+def predicted_by(trusted: Floats, seen: Floats, scale: Scale) -> Predicted:
     """Return which of the first frame's particles (n, 4) are expected in the second, where that is known well enough.
 
     One that was seen there (m, 4) is expected where it was seen.
     """
     first, second = (Seen(each[:, :3], light=Light(each[:, 3])) for each in (trusted, seen))
-    tracks = track(first, second, search_mm, scale)
+    tracks = track(first, second, scale)
     known = known_of(first, second, tracks.first, tracks.second, scale)
-    expected = expected_of(first.position_mm, known, search_mm, scale)
+    expected = expected_of(first.position_mm, known, reach_of(scale), scale)
     at, sigma = trusted.copy(), np.sqrt(expected.variance_mm2)
     at[:, :3] += expected.displacement_mm
     at[tracks.first, :3], sigma[tracks.first] = second.position_mm[tracks.second], 0.0
@@ -232,19 +229,18 @@ REFINING = ((3, 0.1), (4, LAST_UNEXPLAINED))
 CLAIMED_SHARE = 0.6
 
 
-def second_pass(task: Task, own: Floats, neighbours: Sequence[Floats], search_mm: float) -> State:
+def second_pass(task: Task, own: Floats, neighbours: Sequence[Floats]) -> State:
     """Return what is found with the help of neighbour frames.
 
     Parameters
     ----------
     task : the image
     own, neighbours : (n, 4) what first passes found in it and in the frames beside it
-    search_mm : largest displacement along each axis
     """
     state = rebuilt(task, blank(task), own)
     state = with_typical_light(task, state, judged(task, state, LAST_UNEXPLAINED))
     state = with_measured_noise(task, replace(state, noise=noise_with(task, state.typical_light)))
-    missing, partnered = _missing_particles(task, own, neighbours, search_mm)
+    missing, partnered = _missing_particles(task, own, neighbours)
     state = settled(task, rebuilt(task, state, np.concatenate([own, missing])), own[partnered])
     for sweeps, unexplained in REFINING:
         sweep(task, state, unexplained, sweeps, SEARCH_GAIN)
@@ -256,9 +252,7 @@ def second_pass(task: Task, own: Floats, neighbours: Sequence[Floats], search_mm
     return finished(task, merge(task, state), ROUNDS[-1], checks=0)
 
 
-def _missing_particles(
-    task: Task, own: Floats, neighbours: Sequence[Floats], search_mm: float
-) -> tuple[Floats, NDArray[np.bool_]]:
+def _missing_particles(task: Task, own: Floats, neighbours: Sequence[Floats]) -> tuple[Floats, NDArray[np.bool_]]:
     """Return the neighbours' particles (m, 4) that are missing here, where they are expected, and which own ones (n,)
     have partners among them.
     """
@@ -266,7 +260,7 @@ def _missing_particles(
     same = scale.box_mm(SAME_LENSES, SAME_DEPTHS)
     for other in neighbours:
         there, here = (Seen(each[:, :3], light=Light(each[:, 3])) for each in (other, own))
-        tracks = track(there, here, search_mm, scale)
+        tracks = track(there, here, scale)
         alone, partnerless = np.ones(len(other), np.bool_), np.ones(len(own), np.bool_)
         alone[tracks.first] = partnerless[tracks.second] = False
         # Where the other frame's that were not tracked are expected here.
@@ -274,7 +268,7 @@ def _missing_particles(
         if len(tracks.first):
             links = known_of(there, here, tracks.first, tracks.second, scale)
             expected = other.copy()
-            expected[:, :3] += expected_of(there.position_mm, links, search_mm, scale).displacement_mm
+            expected[:, :3] += expected_of(there.position_mm, links, reach_of(scale), scale).displacement_mm
             expected = expected[alone]
         known = np.concatenate([own[partnerless, :3], missing[:, :3]])
         seen = (expected[:, 2] >= task.depths_mm[0]) & (expected[:, 2] <= task.depths_mm[1])

@@ -20,7 +20,7 @@ from lfpiv_cli.robust import MAD_TO_SIGMA
 from lfpiv_cli.tracks.candidates import NO_PARTICLE, NO_TRACK, Frames, Seen, Trajectories, long_ones, places, tracks_in
 from lfpiv_cli.tracks.gridding import kriged, structure_of
 from lfpiv_cli.tracks.in_time import FEWEST_TRACKS, Scatter, State, fit_in_time, scatter_of
-from lfpiv_cli.tracks.tracking import NO_TRACKS, Forecast, Tracks, known_of, link_some, track
+from lfpiv_cli.tracks.tracking import NO_TRACKS, Forecast, Tracks, known_of, link_some, reach_of, track
 
 # A forecast takes a track's last four places: enough for a parabola and to see its noise.
 PAST_FRAMES = 4
@@ -75,12 +75,12 @@ class PartialTracks:
         return len(self.found.labels) - 1
 
 
-def follow(frames: Sequence[Seen], search_mm: float, shortest: int, scale: Scale) -> Trajectories:
+def follow(frames: Sequence[Seen], search_mm: float | None, shortest: int, scale: Scale) -> Trajectories:
     """Follow particles through frames; tracks of fewer than `shortest` places are dropped.
 
     Parameters
     ----------
-    search_mm : largest displacement along each axis from the first frame to the second
+    search_mm : largest displacement from the first frame to the second; None: any
     scale : of the camera
     """
     partial = begun(frames)
@@ -98,7 +98,7 @@ def begun(frames: Frames) -> PartialTracks:
     return PartialTracks(unlinked, Scatter.unknown(), None, None, nothing)
 
 
-def extended(partial: PartialTracks, frames: Frames, search_mm: float, scale: Scale) -> PartialTracks:
+def extended(partial: PartialTracks, frames: Frames, search_mm: float | None, scale: Scale) -> PartialTracks:
     """Return how far it is with one more frame; of `frames` only the new one and the last few before are looked at."""
     number, count = partial.last, len(frames[partial.last + 1])
     found = Trajectories(
@@ -110,11 +110,13 @@ def extended(partial: PartialTracks, frames: Frames, search_mm: float, scale: Sc
     ahead, own = partial.ahead, slice(0, len(start))
     known = np.isfinite(ahead.sigma_mm[own])
     moved = ahead.position_mm[own] - start.position_mm + np.where(known, 0.0, np.nan)
-    links = track(start, end, search_mm, scale, Forecast(moved, ahead.sigma_mm[own]) if known.any() else None)
+    links = track(start, end, scale, search_mm, Forecast(moved, ahead.sigma_mm[own]) if known.any() else None)
     found = _linked(found, number, number + 1, links)
     if number:
         earlier = _forecast(found, frames, number - 1, 2, partial.scatter)
-        found = _linked(found, number - 1, number + 1, _bridges(found, frames, number, earlier, search_mm, scale))
+        found = _linked(
+            found, number - 1, number + 1, _bridges(found, frames, number, earlier, reach_of(scale, search_mm), scale)
+        )
     window = _frames_before(number + 2, PAST_FRAMES)
     position, sigma = places(found, frames, window, tracks_in(found, window))
     scatter = scatter_of([(position, sigma)], np.arange(len(window), dtype=np.float64))
@@ -272,7 +274,7 @@ def _linked(found: Trajectories, start: int, end: int, links: Tracks) -> Traject
 
 
 def _bridges(
-    found: Trajectories, frames: Frames, lost_in: int, forecast: Forecast | None, search_mm: float, scale: Scale
+    found: Trajectories, frames: Frames, lost_in: int, forecast: Forecast | None, reach: Floats, scale: Scale
 ) -> Tracks:
     """Return links over a frame in which tracks have no particle, from the frame before it to the one after."""
     start, end = lost_in - 1, lost_in + 1
@@ -285,7 +287,7 @@ def _bridges(
     through = np.flatnonzero(later != NO_PARTICLE)
     known = known_of(frames[start], frames[end], through, later[through], scale)
     free = found.labels[end] == NO_TRACK
-    return link_some((frames[start], lost), (frames[end], free), known, search_mm, scale, forecast)
+    return link_some((frames[start], lost), (frames[end], free), known, reach, scale, forecast)
 
 
 # Where particles should be in a frame by their tracks before and after it.

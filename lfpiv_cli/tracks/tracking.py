@@ -22,7 +22,7 @@ from lfpiv_cli.arrays import Flags, Floats, Integers
 from lfpiv_cli.grid import Scale
 from lfpiv_cli.robust import MAD_TO_SIGMA
 from lfpiv_cli.threads import share_out
-from lfpiv_cli.tracks.candidates import Candidates, Seen, candidates_of
+from lfpiv_cli.tracks.candidates import Candidates, Seen, candidates_of, common_displacements
 from lfpiv_cli.tracks.gridding import kriged, structure_of
 
 # The first guess of links: neighbours vote for displacements that resemble their own.
@@ -142,13 +142,26 @@ def marginals(first: Integers, second: Integers, odds: Floats, sizes: tuple[int,
 # light spreads by one lens (1.064 mm).
 # Standard error of a depth beside that of a lateral place, in D/L: 4 in Table 2.
 DEPTH_RATIO = 4.0 / 10.64
-# Displacements are sought up to this along each axis by default, in L.
-SEARCH_LENSES = 6.0
+# Displacements are sought this far from where they are expected, in L across and in D along the optical axis, along
+# which errors of depths come on top (Table 2: 0.75 mm); no less far along it than across, as flows may go anywhere.
+REACH_LENSES, REACH_DEPTHS = 7.5, 7.5 / 10.64
+# It is shorter where particles are so dense that one has more candidates than this: 30,000 particles with 120 each take
+# some 0.5 GB, and their votes a minute.
+MOST_CANDIDATES = 120.0
 # Around a forecast, particles are sought up to so many standard errors of it and of both places, and no less than this,
 # in L. How badly a partner's place is known is not known before; nineteen in twenty are known better.
 FORECAST_SIGMAS, FORECAST_LENSES, PARTNERS_SIGMA = 6.0, 1.2, 0.95
 # No displacement is expected better than this, laterally, in L: fits have errors that they do not know of.
 SMALLEST_SIGMA_LENSES = 0.02
+# Particles have moved further than they were sought where fewer than this share of those around them are linked, or in
+# ways that nobody can tell; so many of them are usual where a third of the tracers is lost. A displacement is sought
+# where links let expect it to this share of the reach.
+LINKED_AROUND, FEW_ALONE, SURE_REACH = 0.3, 0.03, 0.5
+# Links are cut off where more than so many lie beyond this share of the reach, if half of all lie far out, too, or if
+# fewer than this share of the particles around them are linked, of those around the others.
+OUTER, FEW_OUTER, FAR, OUTER_LINKED = 0.85, 0.03, 0.5, 0.85
+# How much further the next search goes that does not otherwise add this share of the particles; how many there are.
+WIDER, LEAST_GAIN, MOST_SEARCHES = 1.4, 0.01, 12
 # With fewer links than this their differences do not show how unlike displacements are; a share of the search, over the
 # root of their number, is added to what they let expect.
 FEWEST_OF_FIT = 6
@@ -218,21 +231,109 @@ class Forecast:
     sigma_mm: Floats
 
 
-def track(first: Seen, second: Seen, search_mm: float, scale: Scale, forecast: Forecast | None = None) -> Tracks:
-    """Link two frames' particles, whose displacements are at most `search_mm` along each axis unless forecast.
+def track(
+    first: Seen, second: Seen, scale: Scale, search_mm: float | None = None, forecast: Forecast | None = None
+) -> Tracks:
+    """Link two frames' particles, whose displacements are at most `search_mm` unless forecast; None: any length.
 
     Any number of particles will do; one alone is linked where there is one candidate.
     """
     if not len(first) or not len(second):
         return NO_TRACKS
-    candidates = candidates_of(first, second, *_sought(first, second, search_mm, scale, forecast))
-    density = density_per_mm3(first, second, search_mm)
+    reach = reach_of(scale, search_mm)
+    reach *= min(1.0, MOST_CANDIDATES / _candidates_each(first, second, reach)) ** (1.0 / 3.0)
+    links = _linked_about(np.zeros(first.position_mm.shape), first, second, reach, scale, forecast)
+    if search_mm is not None or forecast is not None or len(first) <= NEIGHBOURS:
+        return links
+    return _sought_further(links, first, second, reach, scale)
+
+
+def reach_of(scale: Scale, search_mm: float | None = None) -> Floats:
+    """Return how far from where they are expected displacements are sought: half axes (3,) of an ellipsoid, mm.
+
+    Parameters
+    ----------
+    search_mm : largest displacement, to which errors of depths come; None: not given
+    """
+    lenses, _, depths = scale.box_mm(REACH_LENSES, REACH_DEPTHS)
+    across = lenses if search_mm is None else search_mm
+    return np.array([across, across, max(across, depths)])
+
+
+def _sought_further(links: Tracks, first: Seen, second: Seen, reach: Floats, scale: Scale) -> Tracks:
+    """Return these links, or more where they leave neighbourhoods without any, or end where the search does.
+
+    Displacements are sought again about those that the links around a particle let expect, and at first about the one
+    that its region shows. Where that adds no links the reach (3,) grows, until that adds none either.
+    """
+    at, low, high = first.position_mm, second.position_mm.min(axis=0), second.position_mm.max(axis=0)
+    near = KDTree(at).query(at, k=np.arange(2, NEIGHBOURS + 2))[1]
+    middle, tried, shown = np.zeros(at.shape), reach, None
+    for _ in range(MOST_SEARCHES):
+        linked = np.zeros(len(at))
+        linked[links.first] = links.probability
+        around = linked[near].mean(axis=1)
+        alone = around < LINKED_AROUND
+        known = known_of(first, second, links.first, links.second, scale)
+        off = (known.displacement_mm - middle[links.first]) / reach
+        is_cut_off = len(off) > 0 and _cut_off(np.linalg.norm(off, axis=1), around[links.first])
+        if np.mean(alone) <= FEW_ALONE and not is_cut_off:
+            break
+        sure = ~alone[links.first]
+        known = Known(links.first[sure], known.displacement_mm[sure], known.variance_mm2[sure])
+        expected, variance = expected_of(at, known, reach, scale)
+        ahead = np.where(np.all(variance < (SURE_REACH * reach) ** 2, axis=1, keepdims=True), expected, middle)
+        if shown is None:
+            shown = common_displacements(first.position_mm, second.position_mm, scale)
+            ahead = np.where(np.isfinite(shown), shown, ahead)
+        # Particles that leave the view have no partner there.
+        leave = np.any((at + ahead < low) | (at + ahead > high), axis=1)
+        if np.mean(alone & ~leave) <= FEW_ALONE and not is_cut_off:
+            break
+        found = _linked_about(ahead, first, second, tried, scale)
+        gained = float(found.probability.sum() - links.probability.sum())
+        is_wider = tried[0] > reach[0]
+        if gained > 0.0:
+            links, middle, reach = found, ahead, tried
+        if gained > LEAST_GAIN * len(at):
+            tried = reach
+        elif is_wider or _candidates_each(first, second, WIDER * reach) > MOST_CANDIDATES:
+            break
+        else:
+            tried = WIDER * reach
+    return links
+
+
+def _cut_off(off: Floats, around: Floats) -> bool:
+    """Return whether links end where the search does, beyond which others are missing.
+
+    Parameters
+    ----------
+    off : (n,) how far their displacements are from where they were sought, 1 at the end
+    around : (n,) the share of particles around each that are linked
+    """
+    outer = off > OUTER
+    if not FEW_OUTER < np.mean(outer) < 1.0:
+        return bool(outer.all())
+    return bool(np.median(off) > FAR or np.mean(around[outer]) < OUTER_LINKED * np.mean(around[~outer]))
+
+
+def _candidates_each(first: Seen, second: Seen, reach: Floats) -> float:
+    """Return how many candidates a particle has within a reach (3,), mm."""
+    return 4.0 / 3.0 * np.pi * float(np.prod(reach)) * density_per_mm3(first, second, reach)
+
+
+def _linked_about(
+    middle_mm: Floats, first: Seen, second: Seen, reach: Floats, scale: Scale, forecast: Forecast | None = None
+) -> Tracks:
+    """Link two frames' particles, whose displacements are sought about `middle_mm` (n, 3) unless forecast."""
+    middle, reached = _sought(middle_mm, first, second, reach, scale, forecast)
+    candidates = candidates_of(first, second, middle, reached, reach)
+    density = density_per_mm3(first, second, reach)
     score = votes(first.position_mm, candidates, density, scale, of_equal_errors(scale))
-    # Short displacements, or those near a forecast, where nobody votes.
-    off = candidates.displacement_mm
-    if forecast is not None:
-        off = off - np.nan_to_num(forecast.displacement_mm)[candidates.first]
-    score = score + -0.5 * np.sum((off / search_mm) ** 2, axis=1)
+    # Those near the middle, where nobody votes.
+    off = candidates.displacement_mm - middle[candidates.first]
+    score = score + -0.5 * np.sum((off / reach) ** 2, axis=1)
     # Each first particle's best pair, and of those that share a second one the best.
     order = np.lexsort((-score, candidates.first))
     best = order[np.unique(candidates.first[order], return_index=True)[1]]
@@ -242,7 +343,7 @@ def track(first: Seen, second: Seen, search_mm: float, scale: Scale, forecast: F
     probability = np.zeros(len(candidates.first))
     for _ in range(ROUNDS):
         known = known_of(first, second, candidates.first[links], candidates.second[links], scale)
-        expected = expected_of(first.position_mm, known, search_mm, scale, forecast)
+        expected = expected_of(first.position_mm, known, reach, scale, forecast)
         expected = _calibrated(expected, known)
         probability = probability_of(candidates, expected, first, second, share, density)
         share = float(np.clip(probability.sum() / len(first), LEAST_PARTNERED, MOST_PARTNERED))
@@ -256,7 +357,7 @@ def link_some(
     first: tuple[Seen, Flags],
     second: tuple[Seen, Flags],
     known: Known,
-    search_mm: float,
+    reach: Floats,
     scale: Scale,
     forecast: Forecast,
 ) -> Tracks:
@@ -264,10 +365,11 @@ def link_some(
     (start, some), (end, free) = first, second
     if not len(start) or not len(end):
         return NO_TRACKS
-    candidates = candidates_of(start, end, *_sought(start, end, search_mm, scale, forecast))
+    middle, reached = _sought(np.zeros(start.position_mm.shape), start, end, reach, scale, forecast)
+    candidates = candidates_of(start, end, middle, reached, reach)
     candidates = candidates.part(some[candidates.first] & free[candidates.second])
-    expected = _calibrated(expected_of(start.position_mm, known, search_mm, scale, forecast), known)
-    density = density_per_mm3(start, end, search_mm)
+    expected = _calibrated(expected_of(start.position_mm, known, reach, scale, forecast), known)
+    density = density_per_mm3(start, end, reach)
     probability = probability_of(candidates, expected, start, end, PARTNERED, density)
     links = np.flatnonzero(probability > LEAST_PROBABILITY)
     return Tracks(candidates.first[links], candidates.second[links], probability[links])
@@ -281,15 +383,15 @@ def known_of(first: Seen, second: Seen, at_first: Integers, at_second: Integers,
 
 
 def expected_of(
-    points: Floats, known: Known, search_mm: float, scale: Scale, forecast: Forecast | None = None
+    points: Floats, known: Known, reach: Floats, scale: Scale, forecast: Forecast | None = None
 ) -> Expected:
     """Return what the known displacements of the neighbours, and a particle's own past, let expect at points (n, 3).
 
     A particle's own displacement takes no part in what is expected of it. The variance includes that of the place.
-    Where nothing is known, any displacement within the search is expected.
+    Where nothing is known, any displacement within the reach (3,) is expected.
     """
     count = len(known.number)
-    value, variance = np.zeros(points.shape), np.full(points.shape, search_mm**2 / 3.0)
+    value, variance = np.zeros(points.shape), np.tile(reach**2 / 3.0, (len(points), 1))
     if count > 1:
         own = np.full(len(points), -1)
         own[known.number] = np.arange(count)
@@ -297,7 +399,7 @@ def expected_of(
         structure = structure_of(at, known.displacement_mm, known.variance_mm2)
         value, variance = kriged(points, own, at, known.displacement_mm, known.variance_mm2, structure)
         if count < FEWEST_OF_FIT:
-            variance = variance + (FEW_SHARE * search_mm) ** 2 / count
+            variance = variance + (FEW_SHARE * reach) ** 2 / count
         # The place where a displacement ends is known as badly as the places of the neighbours' are.
         variance = variance + np.median(known.variance_mm2, axis=0) + 0.5 * structure.nugget
     if forecast is None:
@@ -337,10 +439,10 @@ def probability_of(
     return probability
 
 
-def density_per_mm3(first: Seen, second: Seen, search_mm: float) -> float:
+def density_per_mm3(first: Seen, second: Seen, reach: Floats) -> float:
     """Return the density of the second frame's particles in the box that holds both frames', no smaller than sought."""
     both = np.concatenate([first.position_mm, second.position_mm])
-    return len(second) / float(np.prod(np.maximum(np.ptp(both, axis=0), 2.0 * search_mm)))
+    return len(second) / float(np.prod(np.maximum(np.ptp(both, axis=0), 2.0 * reach)))
 
 
 def wrong_link_variance(probability: Floats, scale: Scale) -> Floats:
@@ -359,19 +461,23 @@ def _variance_of(lenses: float, scale: Scale) -> Floats:
 
 
 def _sought(
-    first: Seen, second: Seen, search_mm: float, scale: Scale, forecast: Forecast | None
+    middle_mm: Floats, first: Seen, second: Seen, reach: Floats, scale: Scale, forecast: Forecast | None
 ) -> tuple[Floats, Floats]:
-    """Return around which displacement (n, 3) and how far along each axis (n,) partners are sought."""
-    middle, reach = np.zeros(first.position_mm.shape), np.full(len(first), search_mm)
+    """Return around which displacements (n, 3) partners are sought, and within which share (n,) of the reach (3,)."""
+    middle, share = middle_mm.copy(), np.ones(len(first))
     if forecast is None:
-        return middle, reach
+        return middle, share
     has_past = np.isfinite(forecast.sigma_mm).all(axis=1) & np.isfinite(forecast.displacement_mm).all(axis=1)
-    middle[has_past] = forecast.displacement_mm[has_past]
-    own, partner = (np.sqrt(frame.covariance()[:, :3].max(axis=1)) for frame in (first, second))
-    sigma = np.hypot(forecast.sigma_mm[has_past].max(axis=1), own[has_past])
-    wide = FORECAST_SIGMAS * np.hypot(sigma, np.quantile(partner, PARTNERS_SIGMA))
-    reach[has_past] = np.clip(wide, FORECAST_LENSES * scale.lens_mm, max(search_mm, FORECAST_LENSES * scale.lens_mm))
-    return middle, reach
+    moved = forecast.displacement_mm[has_past]
+    if has_past.any():
+        # A particle without a past moves as the nearest one that has one.
+        middle = moved[KDTree(first.position_mm[has_past]).query(first.position_mm)[1]]
+    partner = np.quantile(np.sqrt(second.covariance()[:, :3]), PARTNERS_SIGMA, axis=0)
+    variance = forecast.sigma_mm[has_past] ** 2 + first.covariance()[has_past, :3] + partner**2
+    wide = FORECAST_SIGMAS * np.max(np.sqrt(variance) / reach, axis=1)
+    least = FORECAST_LENSES * scale.lens_mm / reach[0]
+    share[has_past] = np.clip(wide, least, max(least, 1.0))
+    return middle, share
 
 
 def _calibrated(expected: Expected, known: Known) -> Expected:

@@ -314,8 +314,8 @@ def _ways(
 
     def made(number: int, name: str, count: int) -> dict[str, Any]:
         frame, digest = frames[number], hashlib.sha256("".join(every[:count]).encode()).hexdigest()
-        command = (
-            f"follow {name} page {frame.page} of {count} frames, SHA-256 {digest}, within {tracking.search_mm:g} mm"
+        command = f"follow {name} page {frame.page} of {count} frames, SHA-256 {digest}" + (
+            "" if tracking.search_mm is None else f", within {tracking.search_mm:g} mm"
         )
         return record(command + words(number), resolved, {**common, "image": frame.path}, {"image": frame.time_s})
 

@@ -35,7 +35,6 @@ from lfpiv_cli.particles.search import LAST_UNEXPLAINED, MUCH_LEFT, Particles, T
 from lfpiv_cli.particles.view import Light, View, ensure_square_cells, raw_view
 from lfpiv_cli.reconstruction.images import Image, Mask, filled, light
 from lfpiv_cli.reconstruction.solvers import Normalisers
-from lfpiv_cli.tracks.tracking import SEARCH_LENSES
 from lfpiv_cli.verbs.frames import (
     IMAGE,
     Bench,
@@ -245,7 +244,7 @@ def find_second(
 ) -> NDArray[np.float64]:
     """Return what `find_first` returns, for the second frame of a pair: with those (n, 4) of the first, `before`."""
     task = task_for(bench, frame)
-    return second_frame(task, task_for(bench, before), particles, SEARCH_LENSES * task.view.scale.lens_mm, progress)
+    return second_frame(task, task_for(bench, before), particles, progress)
 
 
 def find_beside(
@@ -253,7 +252,7 @@ def find_beside(
 ) -> Particles:
     """Return the particles behind an image with the help of the first passes of it and of the frames beside it."""
     task = task_for(bench, frame)
-    return result(task, second_pass(task, own, neighbours, SEARCH_LENSES * task.view.scale.lens_mm))
+    return result(task, second_pass(task, own, neighbours))
 
 
 def _lens_mm(bench: Bench) -> float:

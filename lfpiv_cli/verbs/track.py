@@ -104,7 +104,7 @@ class TrackOptions(PairBatchOptions):
     Attributes
     ----------
     dt_s : time from one frame to the next, in place of the config's
-    search_voxel : displacements are sought up to this along each axis, six microlenses in the scene where None
+    search_voxel : largest displacement; found from the particles where None
     shortest : fewest frames of a track in a sequence, three where None
     grid : vectors on the grid of the correlation windows, too
     by : local polynomials (kriging in rough flows), or one spline field as of `field`, for the grid

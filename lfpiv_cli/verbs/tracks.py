@@ -22,8 +22,8 @@ from lfpiv_cli.notice import warn_of
 from lfpiv_cli.tracks.candidates import Light, Seen, Trajectories, long_ones
 from lfpiv_cli.tracks.in_time import Scatter
 from lfpiv_cli.tracks.sequences import SHORTEST, follow, scatter_in, states_at
-from lfpiv_cli.tracks.tracking import SEARCH_LENSES, wrong_link_variance
 from lfpiv_cli.tracks.tracking import track as match
+from lfpiv_cli.tracks.tracking import wrong_link_variance
 from lfpiv_cli.verbs.checks import few_notices
 
 
@@ -112,7 +112,7 @@ def track(
     dt_s : float, optional
         Time from one frame to the next, s, in place of the rig's `correlation.dt_s`.
     search_voxel : float, optional
-        Displacements are sought up to so many voxels along each axis; six microlenses in the scene when not given.
+        Largest displacement, in voxels by their longest side; when not given, it is found from the particles.
     shortest : int, optional
         Fewest frames of a track in a sequence of more than two; 3 when not given.
 
@@ -151,13 +151,13 @@ class Tracking:
     Attributes
     ----------
     dt_s : time from one frame to the next
-    search_mm : displacements are sought up to this along each axis
+    search_mm : largest displacement; None: found from the particles
     shortest : fewest frames of a track, None where there are only two
     scale : of the camera
     """
 
     dt_s: float
-    search_mm: float
+    search_mm: float | None
     shortest: int | None
     scale: Scale
 
@@ -269,9 +269,7 @@ def tracking_of(settings: Config, search_voxel: float | None, shortest: int | No
         raise InputError(f"{name}: its config has no correlation.dt_s; give --dt-s")
     fewest = None if frames == 2 else SHORTEST if shortest is None else shortest
     scale = settings.camera_model().scale(settings.media_model())
-    search_mm = SEARCH_LENSES * scale.lens_mm
-    if search_voxel is not None:
-        search_mm = search_voxel * max(settings.grid().spacing_mm)
+    search_mm = None if search_voxel is None else search_voxel * max(settings.grid().spacing_mm)
     return Tracking(settings.correlation.dt_s, search_mm, fewest, scale)
 
 
@@ -290,7 +288,7 @@ def tracked(
         points = Points(arrays.pop(POSITION), arrays, reference, reported, provenance)
         return Tracked(points, TRAJECTORIES_FORMAT, paths, summary, settings)
     first, second = frames
-    links = match(seen_in(first), seen_in(second), chosen.search_mm, chosen.scale)
+    links = match(seen_in(first), seen_in(second), chosen.scale, chosen.search_mm)
     # (n, 6) of displacements, mm^2: xx, yy, zz, xy, yz, xz.
     covariance = first.arrays["covariance_mm2"][links.first] + second.arrays["covariance_mm2"][links.second]
     covariance[:, :3] += wrong_link_variance(links.probability, chosen.scale)
