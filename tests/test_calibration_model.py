@@ -169,6 +169,10 @@ def test_the_picture_shows_lattice_and_board(plain: Calibration, rig: Rig, tmp_p
     titles = [axis.get_title() for axis in full.axes]
     assert any("z = 0.200 mm" in title for title in titles)
     assert not any("z =" in axis.get_title() for axis in without.axes)
+    # No title is wider than its panel, so that none runs over another one or over the colours beside it.
+    full.draw_without_rendering()
+    for axis in full.axes:
+        assert axis.title.get_window_extent().width <= axis.get_window_extent().width, axis.get_title()
 
 
 def test_the_summary_shows_residuals_and_dots_without_the_pictures(plain: Calibration, rig: Rig) -> None:

@@ -20,11 +20,14 @@ from lfpiv_cli.pictures import vectors as of_volume
 from lfpiv_cli.pictures import vectors as pictures
 from lfpiv_cli.pictures.style import (
     COLOURS,
+    DIVERGING,
     MARKERS,
+    SEQUENTIAL,
     SETTINGS,
     SLABS,
     new_figure,
     percentiles_by_depth,
+    scale_of,
     styled,
     symmetric_limit,
 )
@@ -106,7 +109,7 @@ def test_space_shows_tracks_by_their_speed_some_of_many_and_none() -> None:
     axes = of_points.space_figure(lines, np.array([0.1, 0.4]), "2 trajectories").axes[0]
     (drawn,) = axes.collections
     np.testing.assert_array_equal(drawn.get_array(), [0.1, 0.4])
-    assert drawn.get_clim() == (0.0, 0.4)
+    assert drawn.get_clim() == (0.1, 0.4)
     np.testing.assert_array_equal(drawn._segments3d[1], position[2:][:, [2, 0, 1]])
     assert [axes.get_xlabel(), axes.get_ylabel(), axes.get_zlabel()] == ["z (mm)", "x (mm)", "y (mm)"]
     position = np.array([[0.0, 0.0, 0.0], [10.0, 0.0, 0.0]])
@@ -259,8 +262,11 @@ def test_components_and_sigma_have_one_scale_and_flags_are_counted(field: NDArra
     np.testing.assert_array_equal(image_of(rows[1, 2]), field.velocity[:, :, 1, 1])
     for row in rows:
         (limits,) = {axes.images[0].get_clim() for axes in row}
-        assert limits[0] == -limits[1]
-    assert {f"{name} (m/s)" for name in "uvw"} <= {axes.get_ylabel() for axes in figure.axes}
+        shown = np.concatenate([image_of(axes).ravel() for axes in row])
+        low, high = np.nanmin(shown), np.nanmax(shown)
+        one_sign = (low, high if high > low else low + 1.0)
+        assert limits == ((-max(-low, high), max(-low, high)) if low < 0.0 < high else one_sign)
+    assert [row[-1].child_axes[0].get_ylabel() for row in rows] == [f"{name} (m/s)" for name in "uvw"]
     rows = np.array(panels(pictures.sigma_figure(field))).reshape(3, 3)
     assert len({axes.images[0].norm for axes in rows.ravel()}) == 1
     np.testing.assert_allclose(np.nanmax(image_of(rows[2, 0])), 0.03)
@@ -324,3 +330,33 @@ def test_figures_of_a_file_follow_what_it_knows(field: NDArray[np.float64], tmp_
     poor = replace(field, uncertainty_voxel=None, dt_s=None)
     write_vectors(path, poor, AT_FOCUS, provenance={}, overwrite=True)
     assert list(figures_of(path)) == ["planes", "components", "profiles", "flags", "displacements"]
+
+
+def test_colours_are_about_zero_where_there_are_both_signs_and_begin_at_the_least_elsewhere() -> None:
+    two = scale_of(np.array([-1.0, np.nan]), np.array([3.0]))
+    assert (two["vmin"], two["vmax"], two["cmap"]) == (-3.0, 3.0, DIVERGING)
+    one = scale_of(np.array([0.07, 0.16]))
+    assert (one["vmin"], one["vmax"], one["cmap"]) == (0.07, 0.16, SEQUENTIAL)
+    for flat in (np.zeros(3), np.full(3, np.nan)):
+        assert scale_of(flat)["vmax"] > scale_of(flat)["vmin"]
+
+
+def test_bars_of_colours_are_as_high_as_their_panels(field: NDArray[np.float64]) -> None:
+    figure = pictures.components_figure(field)
+    figure.draw_without_rendering()
+    bars = [(axes, bar) for axes in figure.axes for bar in axes.child_axes]
+    assert len(bars) == 3
+    for axes, bar in bars:
+        panel, place = axes.get_window_extent(), bar.get_window_extent()
+        np.testing.assert_allclose([place.y0, place.y1], [panel.y0, panel.y1], atol=0.5)
+        assert place.x0 > panel.x1
+
+
+def test_a_series_shows_the_means_of_pairs_in_their_order_with_sigma() -> None:
+    mean = np.arange(12.0).reshape(4, 3)
+    panels = pictures.series_figure(["a", "b", "c", "d"], mean, np.full((4, 3), 0.5)).axes
+    for component, panel in enumerate(panels):
+        np.testing.assert_array_equal(panel.lines[0].get_xydata(), np.stack([[1, 2, 3, 4], mean[:, component]], 1))
+        band = panel.collections[0].get_paths()[0].get_extents()
+        assert (band.y0, band.y1) == (mean[0, component] - 0.5, mean[-1, component] + 0.5)
+    assert panels[-1].get_xlabel() == "pair, from a to d"

@@ -102,7 +102,7 @@ def summary_figure(calibration: Calibration) -> style.Figure:
         _draw_nothing(passed, "transmission not measured")
     else:
         shown = passed.imshow(calibration.transmission, cmap=style.SEQUENTIAL, vmin=0.0, interpolation="nearest")
-        figure.colorbar(shown, ax=passed, label="share of light passed", shrink=0.8)
+        style.colour_bar(figure, shown, passed, "share of light passed")
         passed.set(title="transmission, upright; 0 where unusable", xlabel="column (px)", ylabel="row (px)")
     draw_board_or_rays(figure, board, calibration)
     figure.suptitle(lattice_words(calibration.fit))
@@ -156,10 +156,10 @@ def draw_residual(figure: Any, axis: Any, fit: LatticeFit, direction: int, shape
     residual = (fit.centres_px - fit.centres(fit.indices))[:, direction]
     limit = max(3.0 * float(np.median(np.abs(residual))), 1e-3) if fit.lenses else 1.0
     dots = axis.scatter(*fit.centres_px.T, c=residual, s=4, cmap=style.DIVERGING, vmin=-limit, vmax=limit, linewidths=0)
-    figure.colorbar(dots, ax=axis, label="measured less modelled (px)", shrink=0.8)
+    style.colour_bar(figure, dots, axis, "measured less modelled (px)")
     along = ("columns", "rows")[direction]
     rms = (fit.residual_px if fit.cubic_used else fit.residual_affine_px)[direction]
-    axis.set_title(f"off the lattice along the {along}: rms {rms:.3f} px")
+    axis.set_title(f"off the lattice along the {along}:\nrms {rms:.3f} px")
     axis.set(xlim=(0, shape[1]), ylim=(shape[0], 0), aspect="equal", xlabel="column (px)", ylabel="row (px)")
 
 
@@ -175,7 +175,7 @@ def draw_board_or_rays(figure: Any, axis: Any, calibration: Calibration, board: 
             axis.plot(fit.depths_mm[order], 1e3 * residual[order], "o-", label=f"along the {name}")
         axis.legend()
         axis.set(xlabel="depth of the board (mm)", ylabel="rms misfit on the array (µm)", ylim=(0.0, None))
-        axis.set_title(f"polynomials of degree {fit.rays.degree} through {fit.sightings} sightings of dots")
+        axis.set_title(f"polynomials of degree {fit.rays.degree}\nthrough {fit.sightings} sightings of dots")
         return
     if pose is None:
         _draw_nothing(axis, "no board")
@@ -184,7 +184,7 @@ def draw_board_or_rays(figure: Any, axis: Any, calibration: Calibration, board: 
         image = np.asarray(board, dtype=np.float64)
         axis.imshow(image, cmap="gray", vmin=np.percentile(image, 1.0), vmax=np.percentile(image, 99.9))
     dots = axis.scatter(*pose.dots_px.T, c=pose.dots_mm[:, 2], s=120, cmap=style.SEQUENTIAL, marker="+", linewidths=2)
-    figure.colorbar(dots, ax=axis, label="depth (mm)", shrink=0.8)
+    style.colour_bar(figure, dots, axis, "depth (mm)")
     tilt = " and ".join(f"{angle:z.2f}" for angle in pose.tilt_deg)
     axis.set_title(f"board: z = {pose.z0_mm:z.3f} mm, M = {pose.magnification:.4f},\ntilt {tilt} degrees")
     rows, columns = calibration.image_shape

@@ -59,7 +59,7 @@ def places_figure(position_mm: Floats, light_counts: Floats) -> style.Figure:
     for axes, up in zip(panels, (1, 2), strict=True):
         dots = axes.scatter(position_mm[lit, 0], position_mm[lit, up], c=light_counts[lit], **how)
         axes.set(xlabel="x (mm)", ylabel=f"{style.AXIS_NAMES[up]} (mm)", aspect="equal")
-    figure.colorbar(dots, ax=panels.tolist(), label="light of a particle (counts)")
+    style.colour_bar(figure, dots, panels[-1], "light of a particle (counts)")
     figure.suptitle(f"{len(position_mm)} particles, from the front and from the side")
     return figure
 
@@ -77,7 +77,7 @@ def image_figure(image: Floats, places: Floats, z_mm: Floats) -> style.Figure:
     dots = axes.scatter(places[:, 0], places[:, 1], c=z_mm, s=size, **how)
     rows, columns = image.shape
     axes.set(xlim=(-0.5, columns - 0.5), ylim=(rows - 0.5, -0.5))
-    figure.colorbar(dots, ax=axes, label="depth z (mm)", shrink=0.7)
+    style.colour_bar(figure, dots, axes, "depth z (mm)")
     axes.set_title(f"image and the places of {len(z_mm)} particles (rays through the middle of the lens)")
     return figure
 
@@ -88,7 +88,7 @@ def residual_figure(residual: Floats) -> style.Figure:
     figure, axes = _image_canvas(residual)
     limit = _bright(residual)
     shown = axes.imshow(residual, cmap=style.DIVERGING, vmin=-limit, vmax=limit, interpolation="nearest")
-    figure.colorbar(shown, ax=axes, label="image less particles (counts)", shrink=0.7)
+    style.colour_bar(figure, shown, axes, "image less particles (counts)")
     axes.set_title(f"residual, rms {written(np.sqrt(np.mean(residual**2)))} counts")
     return figure
 
@@ -184,7 +184,8 @@ def space_figure(lines: list[Floats], speed_m_s: Floats, what: str) -> style.Fig
     # (z, x, y): the light comes from the right, y points up
     drawn = Line3DCollection([line[:, [2, 0, 1]] for line in chosen], cmap=style.SEQUENTIAL, linewidths=1.0)
     drawn.set_array(speeds)
-    drawn.set_clim(0.0, float(speeds.max()) if len(speeds) else 1.0)
+    limits = style.scale_of(speeds)
+    drawn.set_clim(limits["vmin"], limits["vmax"])
     axes.add_collection3d(drawn, autolim=False)
     points = np.concatenate(lines) if lines else np.zeros((1, 3))
     low, high = points.min(axis=0), points.max(axis=0)

@@ -98,6 +98,26 @@ def symmetric_limit(*values: ArrayLike) -> float:
     return largest if largest > 0.0 else 1.0
 
 
+# Of a bar beside a panel, in widths of that.
+BAR_GAP, BAR_WIDTH = 0.05, 0.05
+
+
+def colour_bar(figure: Figure, drawn: Any, panel: Axes, label: str, **how: Any) -> Any:
+    """Draw the bar of colours of what is `drawn` beside a panel, as high as that is; `how` as `colorbar` has it."""
+    place = panel.inset_axes((1.0 + BAR_GAP, 0.0, BAR_WIDTH, 1.0))
+    return figure.colorbar(drawn, cax=place, label=label, **how)
+
+
+def scale_of(*values: ArrayLike) -> dict[str, Any]:
+    """Return the colours of values: about zero where they have both signs, else from the least to the largest."""
+    known = np.concatenate([array[np.isfinite(array)] for array in map(np.asarray, values)])
+    low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 1.0)
+    if low < 0.0 < high:
+        limit = symmetric_limit(known)
+        return {"cmap": DIVERGING, "vmin": -limit, "vmax": limit}
+    return {"cmap": SEQUENTIAL, "vmin": low, "vmax": high if high > low else low + 1.0}
+
+
 SLABS = 20
 # A median of fewer points says little.
 FEWEST_POINTS = 3

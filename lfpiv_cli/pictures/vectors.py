@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import groupby
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -110,16 +109,11 @@ class MapRow:
 
 
 @style.styled
-def maps_figure(grid: Grid, rows: Sequence[MapRow], shrink: float = 1.0) -> style.Figure:
-    """Return rows of maps in the three middle planes; neighbours whose colours are called alike share their bar."""
+def maps_figure(grid: Grid, rows: Sequence[MapRow]) -> style.Figure:
+    """Return rows of maps in the three middle planes, each with the bar of its colours."""
     figure, axes = plane_panels(grid, rows=len(rows))
-    drawn = zip(axes, rows, strict=True)
-    for label, group in groupby(drawn, key=lambda each: each[1].label):
-        of_bar = []
-        for panels, row in group:
-            image = draw_maps(panels, grid, row.maps, row.titles, **row.scale)
-            of_bar += panels.tolist()
-        figure.colorbar(image, ax=of_bar, label=label, shrink=shrink)
+    for panels, row in zip(axes, rows, strict=True):
+        style.colour_bar(figure, draw_maps(panels, grid, row.maps, row.titles, **row.scale), panels[-1], row.label)
     return figure
 
 
@@ -182,7 +176,7 @@ def compared_figure(grid: Grid, fields: Mapping[str, Floats], unit: str) -> styl
     """
     figure, axes = plane_panels(grid, rows=len(fields))
     across = {name: [values[..., plane.normal] for plane in PLANES] for name, values in fields.items()}
-    scale = signed_scale(*across.values())
+    scale = middle_scale(*across.values())
     longest = style.symmetric_limit(
         *(plane.of(values)[..., [plane.right, plane.up]] for values in fields.values() for plane in PLANES)
     )
@@ -194,6 +188,7 @@ def compared_figure(grid: Grid, fields: Mapping[str, Floats], unit: str) -> styl
         components = [style.COMPONENT_NAMES[plane.normal] for plane in PLANES]
         titles = [f"{name}: {component}" if name else component for component in components]
         image = draw_maps(row, grid, across[name], titles, **scale)
+        style.colour_bar(figure, image, row[-1], f"component across the plane ({unit})")
         for panel, plane in zip(row, PLANES, strict=True):
             chosen = (slice(None, None, step[plane.up]), slice(None, None, step[plane.right]))
             of_plane = plane.of(values)[chosen]
@@ -205,7 +200,6 @@ def compared_figure(grid: Grid, fields: Mapping[str, Floats], unit: str) -> styl
     length = float(f"{0.7 * longest:.1g}")
     place = 1.0 - 0.25 / figure.get_figheight()
     axes[0, 0].quiverkey(arrows, 0.96, place, length, f"{length:g} {unit}", coordinates="figure", labelpos="W")
-    figure.colorbar(image, ax=axes.ravel().tolist(), label=f"component across the plane ({unit})", shrink=0.75)
     return figure
 
 
@@ -219,16 +213,13 @@ def components_figure(field: VectorField) -> style.Figure:
     """Each velocity component in the three middle planes, a row and a scale for each."""
     quantity = shown(field)
     each = [(name, [quantity.values[..., component]] * 3) for component, name in enumerate(style.COMPONENT_NAMES)]
-    rows = [MapRow(maps, [name] * 3, f"{name} ({quantity.unit})", signed_scale(maps)) for name, maps in each]
+    rows = [MapRow(maps, [name] * 3, f"{name} ({quantity.unit})", middle_scale(maps)) for name, maps in each]
     return maps_figure(field.grid, rows)
 
 
-def signed_scale(*rows: Sequence[Floats]) -> dict[str, Any]:
-    """Return the colours of rows of three maps with a sign, symmetric about zero: by what the middle planes show."""
-    limit = style.symmetric_limit(
-        *(plane.of(values) for maps in rows for plane, values in zip(PLANES, maps, strict=True))
-    )
-    return {"cmap": style.DIVERGING, "vmin": -limit, "vmax": limit}
+def middle_scale(*rows: Sequence[Floats]) -> dict[str, Any]:
+    """Return the colours of rows of three maps, see `style.scale_of`: by what the middle planes show."""
+    return style.scale_of(*(plane.of(values) for maps in rows for plane, values in zip(PLANES, maps, strict=True)))
 
 
 @style.styled
@@ -255,6 +246,26 @@ def profiles_figure(field: VectorField) -> style.Figure:
         axes[-1, k].set_xlabel(f"{style.AXIS_NAMES[k]} (mm)")
     if quantity.sigma is not None:
         axes[0, 0].legend()
+    return figure
+
+
+@style.styled
+def series_figure(names: Sequence[str], mean_m_s: Floats, sigma_m_s: Floats) -> style.Figure:
+    """The mean velocity of each pair in their order. The band is the usual stated standard deviation of one vector to
+    both sides.
+
+    `mean_m_s` and `sigma_m_s` (n, 3) are of `names`, the first and the last of which are told.
+    """
+    figure, panels = style.new_panels(10.0, 5.5, 3, 1, sharex=True)
+    numbers = np.arange(1, len(names) + 1)
+    for component, panel in enumerate(panels):
+        mean, sigma, colour = mean_m_s[:, component], sigma_m_s[:, component], style.COLOURS[component]
+        panel.plot(numbers, mean, "o-", color=colour)
+        panel.fill_between(numbers, mean - sigma, mean + sigma, color=colour, alpha=0.25, linewidth=0.0, label="± σ")
+        panel.set_ylabel(f"{style.COMPONENT_NAMES[component]} (m/s)")
+    panels[0].legend()
+    panels[-1].xaxis.get_major_locator().set_params(integer=True)
+    panels[-1].set_xlabel(f"pair, from {names[0]} to {names[-1]}")
     return figure
 
 
@@ -293,7 +304,7 @@ def sigma_figure(field: VectorField) -> style.Figure:
         ([quantity.sigma[..., component]] * 3, [f"σ of {name}"] * 3)
         for component, name in enumerate(style.COMPONENT_NAMES)
     ]
-    return maps_figure(field.grid, [MapRow(maps, titles, label, scale) for maps, titles in each], shrink=0.6)
+    return maps_figure(field.grid, [MapRow(maps, titles, label, scale) for maps, titles in each])
 
 
 @style.styled
@@ -317,8 +328,8 @@ def flags_figure(field: VectorField) -> style.Figure:
 
 
 def quality_figure(field: VectorField, names: dict[str, Floats]) -> style.Figure:
-    """Return maps of quantities [z, y, x] that tell how good vectors are (rows), each on its own scale from zero."""
-    scales = [{"vmin": 0.0, "vmax": style.symmetric_limit(values)} for values in names.values()]
+    """Return maps of quantities [z, y, x] that tell how good vectors are (rows), each on its own scale."""
+    scales = [middle_scale([values] * 3) for values in names.values()]
     each = zip(names.items(), scales, strict=True)
     return maps_figure(field.grid, [MapRow([values] * 3, [""] * 3, name, scale) for (name, values), scale in each])
 
@@ -363,9 +374,9 @@ def gradients_figure(field: VectorField) -> style.Figure:
     across = [derived.vorticity[..., plane.normal] for plane in PLANES]
     names = [f"vorticity along {style.AXIS_NAMES[plane.normal]}" for plane in PLANES]
     # One scale for both: the divergence, which should be zero, tells how much of the vorticity is noise.
-    scale = signed_scale(across, [derived.divergence] * 3)
+    scale = middle_scale(across, [derived.divergence] * 3)
     rows = [(across, names), ([derived.divergence] * 3, ["divergence"] * 3)]
-    return maps_figure(field.grid, [MapRow(maps, titles, "1/s", scale) for maps, titles in rows], shrink=0.7)
+    return maps_figure(field.grid, [MapRow(maps, titles, "1/s", scale) for maps, titles in rows])
 
 
 # A reconstructed volume [z, y, x], and weights: where a voxel's light falls, and how much by depth.
@@ -423,7 +434,7 @@ def projections_figure(volume: Singles, grid: Grid) -> style.Figure:
     limit = float(np.percentile(np.concatenate([each.ravel() for each in seen]), BRIGHT_PERCENT)) or 1.0
     titles = [f"largest along {style.AXIS_NAMES[plane.normal]}" for plane in PLANES]
     image = draw_maps(axes[0], grid, seen, titles, cmap="inferno", vmin=0.0, vmax=limit)
-    figure.colorbar(image, ax=axes[0].tolist(), label="intensity (1)", shrink=0.75, extend="max")
+    style.colour_bar(figure, image, axes[0, -1], "intensity (1)", extend="max")
     return figure
 
 

@@ -13,7 +13,7 @@ from lfpiv_cli.arrays import Floats
 from lfpiv_cli.flow.field import VectorField
 from lfpiv_cli.flow.windows import RoundWall
 from lfpiv_cli.pictures import style
-from lfpiv_cli.pictures.vectors import MapRow, compared_figure, maps_figure, mean_of_known, signed_scale, speed_unit
+from lfpiv_cli.pictures.vectors import MapRow, compared_figure, maps_figure, mean_of_known, middle_scale, speed_unit
 from lfpiv_cli.validation.flow import INNER, PAPER_SLICES, TOLERANCE, Duct, Measured, cumulative_distribution, table_4
 
 
@@ -114,7 +114,7 @@ def errors_figure(methods: Mapping[str, Measured]) -> style.Figure:
     rows = []
     for component, letter in enumerate(style.COMPONENT_NAMES):
         maps = {name: [factor * error[..., component]] * 3 for name, error in errors.items()}
-        label, scale = f"{letter}, measured less true ({unit})", signed_scale(*maps.values())
+        label, scale = f"{letter}, measured less true ({unit})", middle_scale(*maps.values())
         rows += [MapRow(each, [f"{name}: error of {letter}"] * 3, label, scale) for name, each in maps.items()]
     return maps_figure(next(iter(methods.values())).field.grid, rows)
 
