@@ -1,6 +1,7 @@
 """`report` and `plot`: what is found in a folder, the figures of each kind of file, the page made of them."""
 
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from lfpiv_cli.errors import InputError, OutputExistsError, UsageError
 from lfpiv_cli.files.config import load_rig
 from lfpiv_cli.files.hdf5 import write_tree
 from lfpiv_cli.files.images import write_tiff
+from lfpiv_cli.files.pages import Page, Picture
 from lfpiv_cli.files.particle_file import (
     PARTICLES_FORMAT,
     TRACKS_FORMAT,
@@ -24,12 +26,13 @@ from lfpiv_cli.files.particle_file import (
     write_points,
 )
 from lfpiv_cli.files.provenance import sha256
-from lfpiv_cli.files.vtkhdf import write_vectors, write_volume
+from lfpiv_cli.files.vtkhdf import open_vectors, write_vectors, write_volume
 from lfpiv_cli.grid import Grid, Reference
 from lfpiv_cli.pictures.points import MOST_LINES, lines_view
+from lfpiv_cli.verbs import checks
 from lfpiv_cli.verbs import report as stage
 from lfpiv_cli.verbs.plot import figures_of
-from lfpiv_cli.verbs.report import ReportOptions, contents_of, report
+from lfpiv_cli.verbs.report import ReportOptions, contents_of, judged, report
 from tests.browser import CHROMIUM, opened
 from tests.commands import ROOT, run, table2_rig, told
 from tests.vector_fields import SHAPE, SIGMA_VOXEL, field_of, noise_mm, rotation_mm
@@ -100,7 +103,7 @@ def test_the_page_holds_all(results: Path, tmp_path: Path) -> None:
     for words in ("Vectors", "Tracks", "Warnings", "Settings", "Provenance", "pitch_mm: 0.125", "few-tracers"):
         assert words in text
     assert "a &lt;b&gt;: too few" in text
-    assert text.count('<figure><img src="data:image/png;base64,') == summary["pictures"]
+    assert text.count('><img src="data:image/png;base64,') == summary["pictures"]
     outcome = CliRunner().invoke(cli, ["report", str(results), "-o", str(tmp_path / "again.html")])
     assert outcome.exit_code == 0, outcome.output
     assert re.search(r"verdict +calibration look, images look, vectors look", outcome.stdout)
@@ -171,16 +174,100 @@ def test_vectors_of_different_times_are_not_held_against_each_other(tmp_path: Pa
 
 
 @pytest.mark.thorough
-def test_of_all_but_the_best_vectors_a_few_figures_are_drawn(
+def test_of_all_but_the_best_vectors_one_figure_is_drawn(
     results: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(stage, "figures_of", figures_of)
     drawn: list[str] = []
-    monkeypatch.setattr(stage.Drawer, "_drawn", lambda _self, caption, _figure: drawn.append(caption.split(":")[0]))
+
+    def noted(_self: object, caption: str, _figure: object) -> Picture:
+        drawn.append(caption.split(":")[0])
+        return Picture(tmp_path, caption)
+
+    monkeypatch.setattr(stage.Drawer, "_drawn", noted)
     monkeypatch.setattr(stage, "write_pages", lambda *_given: None)
+    grid = results / "tracked" / "grid.vtkhdf"
+    write_vectors(grid, open_vectors(grid), REFERENCE, provenance=record("track"), overwrite=True)
     report(results, tmp_path / "page.html", console=QUIET)
-    assert drawn.count("grid.vtkhdf") > 5
-    assert drawn.count("vectors.vtkhdf") == 3
+    # alike in all else, the one whose name is first
+    assert (drawn.count("grid.vtkhdf"), drawn.count("vectors.vtkhdf")) == (3, 1)
+
+
+def test_the_first_line_tells_how_much_how_fast_how_well_and_what_is_against_it(
+    results: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pages: list[Page] = []
+    monkeypatch.setattr(stage, "write_pages", lambda page, *_given: pages.append(page))
+    report(results, tmp_path / "page.html", console=QUIET)
+    number = 2 * np.prod(SHAPE)
+    size = "8.8 x 6 x 9.9 mm"
+    assert pages[0].title.startswith(f"{number:,} vectors of 2 pairs in {size}; ")
+    # 0.05 voxel of 0.1 mm, 0.4 of 0.3 mm in 1 ms
+    assert "known to 0.005 m/s across and 0.12 m/s in depth; 3 faults speak against it." in pages[0].title
+    faults, remarks = pages[0].sections[:2]
+    assert [word for word, _ in faults.points] == ["look"] * 3
+    assert "a <b>: too few; seed more" in [text for _, text in faults.points]
+    assert [word for word, _ in remarks.points] == [""] * len(remarks.points)
+
+
+def few_planes(folder: Path, planes: int) -> set[str]:
+    """Return what a field of some planes across z says against itself."""
+    flow = np.zeros((*SHAPE, 3))
+    flow[..., 0] = 1.0
+    field = field_of(flow, SIGMA_VOXEL)
+    cut = {
+        name: getattr(field, name)[:planes]
+        for name in ("displacement_voxel", "displacement_raw_voxel", "correlation", "peak_ratio", "valid_fraction")
+    }
+    grid = Grid((*SHAPE[:0:-1], planes), field.grid.spacing_mm, field.grid.origin_mm)
+    few = replace(field, grid=grid, flag=field.flag[:planes], uncertainty_voxel=field.uncertainty_voxel[:planes], **cut)
+    return {line.reason for line in checks.of_vectors(few, "f") if line.verdict != "good"}
+
+
+def test_two_planes_are_not_good(tmp_path: Path) -> None:
+    assert few_planes(tmp_path, 3) == set()
+    assert any("planes of vectors along z: 2" in reason for reason in few_planes(tmp_path, 2))
+
+
+def test_the_verdict_is_of_tracks_where_volumes_beside_them_are_poor(tmp_path: Path) -> None:
+    flow = np.zeros((*SHAPE, 3))
+    flow[..., 0] = 1.0
+    for name, command, warnings in (("tracks_grid", "track", ()), ("vectors", "correlate", (WARNING,))):
+        made = record(command, *warnings)
+        field = field_of(flow + (5.0 * noise_mm(1) if name == "vectors" else 0.0), SIGMA_VOXEL)
+        write_vectors(tmp_path / f"{name}.vtkhdf", field, REFERENCE, provenance=made, overwrite=False)
+    contents = contents_of(tmp_path)
+    fields = {path: open_vectors(path) for path in contents.of("vectors")}
+    said = {line.reason: line.verdict for line in judged(contents, fields)["vectors"]}
+    assert set(said.values()) == {"good"}
+    assert "a <b>: too few; seed more" in said
+    assert any(reason.startswith("the verdict on vectors is of those by track") for reason in said)
+    # alone, what is said of volumes counts
+    (tmp_path / "tracks_grid.vtkhdf").unlink()
+    alone = contents_of(tmp_path)
+    assert "look" in {line.verdict for line in judged(alone, dict(list(fields.items())[1:]))["vectors"]}
+
+
+def test_many_pairs_stand_in_their_order_and_settings_have_no_empty_ones(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pages: list[Page] = []
+    monkeypatch.setattr(stage, "write_pages", lambda page, *_given: pages.append(page))
+    made = record("correlate")
+    made["config"] = {"camera": {"pitch_mm": 0.125, "name": None}, "pipe": {"axis": None}, "windows": [None, 8]}
+    flow = np.zeros((*SHAPE, 3))
+    for number in (10, 9, 1):
+        flow[..., 0] = 0.1 * number
+        field = field_of(flow, SIGMA_VOXEL / number)
+        write_vectors(tmp_path / f"p{number}.vtkhdf", field, REFERENCE, provenance=made, overwrite=False)
+    summary = report(tmp_path, tmp_path / "page.html", console=QUIET)
+    sections = {section.title: section for section in pages[0].sections}
+    table = sections["Vectors"].tables[0]
+    assert [row[0] for row in table.rows] == ["p1.vtkhdf", "p9.vtkhdf", "p10.vtkhdf"]
+    assert [row[3].split(",")[0] for row in table.rows] == ["0.1", "0.9", "1"]
+    # the series, and planes, profiles and errors of the mean
+    assert len(sections["Vectors"].pictures) == summary["pictures"] == 4
+    assert list(sections["Settings"].commands) == ["camera: {pitch_mm: 0.125}", "windows: [null, 8]"]
 
 
 @pytest.mark.thorough

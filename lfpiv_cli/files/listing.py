@@ -195,7 +195,7 @@ def expanded(paths: Iterable[Path], kind: InputKind) -> list[Path]:
     return found
 
 
-def _natural(name: str) -> list[str | int]:
+def natural(name: str) -> list[str | int]:
     """Return the parts of a name, numbers by their value; texts and numbers take turns."""
     return [int(part) if place % 2 else part for place, part in enumerate(re.split(r"([0-9]+)", name.casefold()))]
 
@@ -221,4 +221,4 @@ def files_in(folder: Path, kind: InputKind) -> list[Path]:
                     is_of_kind = format_of(path).in_folders
             if is_of_kind:
                 found.append(path)
-    return sorted(found, key=lambda path: (_natural(path.name), path.name))
+    return sorted(found, key=lambda path: (natural(path.name), path.name))

@@ -64,10 +64,11 @@ class Table:
 
 @dataclass(frozen=True)
 class Picture:
-    """A PNG file and what it shows."""
+    """A PNG file and what it shows; on paper alone where a view stands for it on a screen."""
 
     path: Path
     caption: str
+    on_paper: bool = False
 
 
 @dataclass(frozen=True)
@@ -77,6 +78,7 @@ class Section:
     Attributes
     ----------
     anchor : its name in links
+    points : what is said, a line each, with a verdict or nothing before it
     commands : what a person types to make its figures, or settings as they stand in a file
     view : an interactive picture as HTML that loads nothing; on paper, and in Markdown, its pictures stand for it
     """
@@ -88,6 +90,7 @@ class Section:
     pictures: tuple[Picture, ...] = ()
     commands: tuple[str, ...] = ()
     view: str = ""
+    points: tuple[tuple[str, str], ...] = ()
 
 
 @dataclass(frozen=True)

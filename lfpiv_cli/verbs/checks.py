@@ -418,6 +418,12 @@ def of_vectors(field: VectorField, name: str) -> list[Line]:
                         "displacement; particles in place of volumes, or a longer time between the images, tell more"
                     )
                     reasons.append(Line("vectors", "look", text))
+    sizes = zip("xyz", field.grid.shape_xyz, field.window_voxel, strict=True)
+    # A single one of windows that are a voxel wide is a plane by intent.
+    few = {axis: count for axis, count, width in sizes if count < FEWEST_ALONG_AXIS and (count > 1 or width > 1)}
+    for axis, count in few.items():
+        text = f"{name}: planes of vectors along {axis}: {count}, which show no profile"
+        reasons.append(Line("vectors", "look", f"{text}; smaller windows along it, or a deeper volume"))
     ratio = divergence_over_stated(field)
     if ratio is not None and ratio > LARGEST_OVER_STATED:
         text = f"{name}: the divergence is {ratio:.1f} times what the stated errors make, and a liquid has none"

@@ -21,6 +21,7 @@ from lfpiv_cli.files.atomic import ensure_writable
 from lfpiv_cli.files.calibration_file import open_calibration
 from lfpiv_cli.files.hdf5 import open_h5, read_provenance
 from lfpiv_cli.files.images import count_pages
+from lfpiv_cli.files.listing import natural
 from lfpiv_cli.files.pages import (
     Page,
     Picture,
@@ -41,9 +42,11 @@ from lfpiv_cli.files.particle_file import (
 )
 from lfpiv_cli.files.provenance import sha256
 from lfpiv_cli.files.vtkhdf import VECTORS_FORMAT, VOLUME_FORMAT, open_vectors, read_header
-from lfpiv_cli.flow.field import MASKED, REJECTED, VALID, VectorField
+from lfpiv_cli.flow.field import MASKED, REJECTED, VALID, VectorField, statistics_of
 from lfpiv_cli.notice import written
 from lfpiv_cli.pictures.points import MOST_LINES, has_views, lines_view, trajectory_lines
+from lfpiv_cli.pictures.style import caption_of
+from lfpiv_cli.pictures.vectors import planes_figure, profiles_figure, series_figure, sigma_figure
 from lfpiv_cli.verbs import checks
 from lfpiv_cli.verbs.plot import figures_of
 
@@ -63,15 +66,21 @@ KINDS = {
 SUFFIXES = (".h5", ".vtkhdf")
 # Folders below the one that is given: of volumes, of particles, of a batch's vectors.
 DEEPEST = 2
-# A table of a batch ends here, and pictures are of the first file of each kind, of vectors of so many.
-LONGEST_TABLE, MOST_FIELDS = 100, 3
-# What is drawn of vectors beside the best ones: a figure takes a second.
-OF_OTHERS = ("planes", "profiles", "sigma")
+# Tables of vectors end here, and others.
+LONGEST_TABLE, LONGEST_OTHER = 60, 20
+# So many files of vectors are read, and so many reasons of one kind are told.
+MOST_FIELDS, MOST_REASONS = 1000, 3
+# Commands, by their records, whose vectors are made of others that stand beside them.
+MEAN = "correlate mean"
+MADE_OF_OTHERS = (MEAN, "combine")
+# What is drawn of the vectors that the verdict is of, of others, and of other files: a page of paper holds three.
+OF_VECTORS, OF_OTHERS = ("planes", "profiles", "sigma"), ("planes",)
+OF_PARTICLES, OF_VOLUMES = ("image", "residual", "depths"), ("projections",)
+OF_TRACKS, OF_WEIGHTS = ("space", "sigma"), ("light",)
 # A cell of a figure that is not known.
 UNKNOWN = "–"
 # Vectors by their files.
 Fields = Mapping[Path, VectorField]
-TITLE = "Velocity from light-field images"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -132,33 +141,86 @@ def report(
     ensure_pages()
     ensure_drawing()
     contents = contents_of(folder)
-    fields = {path: open_vectors(path) for path in contents.of("vectors")[:LONGEST_TABLE]}
-    # Those with the smallest stated errors first.
-    fields = dict(sorted(fields.items(), key=lambda item: _sigma(item[1])))
-    judged_parts = judged(contents, fields)
-    words = {part: checks.worst(lines, "good") for part, lines in judged_parts.items()}
+    fields = {path: open_vectors(path) for path in contents.of("vectors")[:MOST_FIELDS]}
+    parts = judged(contents, fields)
+    words = {part: checks.worst(lines, "good") for part, lines in parts.items()}
+    every = sorted((line for lines in parts.values() for line in lines), key=_by_file)
+    faults = [line for line in every if line.verdict in ("no", "look")]
     advice = "Nothing speaks against these vectors, as far as images and vectors tell it themselves."
-    if "no" in words.values():
-        advice = "Do not use these vectors before what is said below is mended."
-    elif "look" in words.values():
-        advice = "Look at what is said below before you use these vectors."
-    reported = {part: "; ".join(each.reason for each in lines) for part, lines in judged_parts.items()}
-    rows = tuple((part, words[part], reported[part] or "nothing speaks against it") for part in judged_parts)
-    verdict = Table("Verdict: good, look (at the reasons), or no", ("part", "verdict", "reasons"), rows)
+    if faults:
+        use = "Do not use these vectors before" if "no" in words.values() else "Before you use these vectors, look at"
+        advice = f"{use} what is said below" + (" is mended." if "no" in words.values() else ".")
+    counts = {part: sum(line in faults for line in lines) for part, lines in parts.items()}
+    rows = tuple((part, words[part], str(counts[part])) for part in parts)
+    verdict = Table("Verdict: good, look (at the faults), or no", ("part", "verdict", "faults"), rows)
+    points = tuple((line.verdict, line.reason) for line in faults)
+    remarks = tuple(("", line.reason) for line in every if line not in faults)
+    said = [Section("Faults", "faults", points=points), Section("Remarks", "remarks", points=remarks)]
     with TemporaryDirectory() as pictures:
         drawer = Drawer(contents, Path(pictures), {sha256(path): path for path in options.raw})
-        sections = [*_chain(contents, fields, drawer), *_records(contents)]
+        sections = [*(each for each in said if each.points), *_chain(contents, fields, drawer), *_records(contents)]
         if not has_views():
             console.say('the page has no view to turn: that needs plotly, pip install "lfpiv[report]"')
         made = contents.last
         foot = f"Made by lfpiv {made.get('version')} from the files in {folder.resolve().name}."
-        write_pages(Page(TITLE, (advice,), (verdict,), tuple(sections), foot), [output], overwrite)
+        title = _sentence(contents, fields, len(faults))
+        write_pages(Page(title, (advice,), (verdict,), tuple(sections), foot), [output], overwrite)
     return {"files": len(contents.records), "pictures": drawer.count, "verdict": words}
+
+
+def _by_file(line: checks.Line) -> tuple[bool, list[str | int]]:
+    """Return what lines are ordered by: the file that they are about, if they are about one."""
+    return ":" not in line.reason, natural(line.reason)
+
+
+def _sentence(contents: Contents, fields: Fields, faults: int) -> str:
+    """Return how much was measured, where, how fast it is, how well that is known and what is against it.
+
+    "Up to" leaves out the few percent at the end of a range, of which some are false.
+    """
+    against = "nothing contradicts it"
+    if faults:
+        against = f"{faults} faults speak against it" if faults > 1 else "one fault speaks against it"
+    first, tracks = next(iter(_by_command(contents, fields).values()), []), contents.of("tracks")
+    if tracks and (not first or (len(first) == 1 and checks.verb_of(contents.record(first[0])) != "correlate")):
+        points = open_tracks(tracks[0])
+        track = points.arrays.get("track")
+        number = f"{len(points.position_mm) if track is None else len(np.unique(track)):,} tracks"
+        size, velocity, sigma = points.position_mm, points.arrays["velocity"], points.arrays["velocity_sigma"]
+        sides = np.ptp(size, axis=0) if len(size) else np.zeros(3)
+    elif first:
+        ours = [fields[path] for path in first]
+        there = [field.flag < REJECTED for field in ours]
+        pairs = f" of {len(first)} pairs" if len(first) > 1 else ""
+        number = f"{sum(map(np.count_nonzero, there)):,} vectors{pairs}"
+        velocity = np.concatenate([field.velocity[known] for field, known in zip(ours, there, strict=True)])
+        sigma = np.array([checks.velocity_of(field)[1] for field in ours])
+        sides = np.array([np.ptp(field_axis) for field_axis in map(ours[0].grid.bounds_mm, range(3))])
+    else:
+        return f"No vectors and no tracks are in {contents.folder.resolve().name}; {against}."
+    text = f"{number} in {' x '.join(written(side, 2) for side in sides)} mm"
+    speed = np.abs(velocity[np.isfinite(velocity).all(axis=1)])
+    if len(speed):
+        usual = np.percentile(speed, 100.0 - checks.LEFT_OUT_PERCENT, axis=0)
+        text += f"; {'uvw'[int(np.argmax(usual))]} up to {written(usual.max())} m/s"
+    known = sigma[np.isfinite(sigma).all(axis=1)]
+    if len(known):
+        u, v, w = np.median(known, axis=0)
+        text += f", known to {written(max(u, v), 2)} m/s across and {written(w, 2)} m/s in depth"
+    return f"{text}; {against}."
 
 
 def judged(contents: Contents, fields: Fields) -> dict[checks.Part, list[checks.Line]]:
     """Return what speaks for and against each part of the chain, the worst first."""
-    reasons = [*checks.of_warnings(contents.all_records), *_of_all_vectors(contents, fields)]
+    ours = _by_command(contents, fields)
+    others = list(ours)[1:]
+    of_others = {name: made for name, made in contents.all_records.items() if checks.verb_of(made) in others}
+    records = {name: made for name, made in contents.all_records.items() if name not in of_others}
+    reasons = [*checks.of_warnings(records), *_of_all_vectors(contents, fields)]
+    reasons += [replace(each, verdict="good") for each in checks.of_warnings(of_others)]
+    if others:
+        text = f"the verdict on vectors is of those by {next(iter(ours))}; what is said of those by"
+        reasons.append(checks.Line("vectors", "good", f"{text} {' and '.join(others)} does not count in it"))
     made_by = {checks.verb_of(record) for record in contents.all_records.values()}
     counted: list[tuple[checks.Part, bool, str]] = [
         (
@@ -185,7 +247,8 @@ def contents_of(folder: Path, only: Iterable[Path] | None = None) -> Contents:
     files: dict[str, list[Path]] = {}
     records: dict[str, Mapping[str, Any]] = {}
     paths = folder.rglob("*") if only is None else (path for path in only if path.exists())
-    for path in sorted(path for path in paths if path.suffix in SUFFIXES):
+    ours = (path for path in paths if path.suffix in SUFFIXES)
+    for path in sorted(ours, key=lambda path: (natural(path.as_posix()), path)):
         parts = path.relative_to(folder).parts
         if len(parts) > DEEPEST or any(part.startswith(".") for part in parts):
             continue
@@ -233,6 +296,18 @@ class Drawer:
         chosen = [each for name, each in figures_of(path, raw).items() if not only or name in only]
         return [self._drawn(f"{path.name}: {each.caption}", each.draw()) for each in chosen]
 
+    def of_batch(self, fields: Mapping[str, VectorField]) -> list[Picture]:
+        """Return pictures of fields of one kind by name: each one's means in their order, and the mean of all."""
+        mean, sigma = (np.array(each) for each in zip(*map(checks.velocity_of, fields.values()), strict=True))
+        found = [self._drawn(caption_of(series_figure), series_figure(list(fields), mean, sigma))]
+        try:
+            whole = statistics_of(fields.values()).mean
+        except InputError:  # they have no mean
+            return found
+        for draw in (planes_figure, profiles_figure, sigma_figure):
+            found.append(self._drawn(f"The mean of {len(fields)} fields: {caption_of(draw)}", draw(whole)))
+        return found
+
     def _drawn(self, caption: str, figure: Figure) -> Picture:
         target = self.folder / f"{self.count:04d}.png"
         self.count += 1
@@ -240,63 +315,102 @@ class Drawer:
         return Picture(target, caption)
 
 
+def _by_command(contents: Contents, fields: Fields) -> dict[str, list[Path]]:
+    """Return the files of vectors by the command that made them, those that the verdict is of first.
+
+    These are the ones that least speaks against, of several the ones with the smallest stated errors. What is made of
+    them, combined or as a mean, comes last.
+    """
+    found: dict[str, list[Path]] = {}
+    for path in fields:
+        made = contents.record(path)
+        found.setdefault(MEAN if made.get("command") == MEAN else checks.verb_of(made), []).append(path)
+
+    def rank(command: str) -> tuple[bool, int, float]:
+        paths = found[command]
+        lines = [line for path in paths for line in checks.of_vectors(fields[path], path.name)]
+        lines += checks.of_warnings({str(path): contents.record(path) for path in paths})
+        sigma = float(np.median([_sigma(fields[path]) for path in paths]))
+        return command in MADE_OF_OTHERS, checks.ORDER.index(checks.worst(lines)), sigma
+
+    return {command: found[command] for command in sorted(found, key=rank)}
+
+
 def _of_all_vectors(contents: Contents, fields: Fields) -> list[checks.Line]:
     """Return what vectors say of themselves and of each other.
 
     What speaks against vectors that better ones by another command stand beside is told, and not counted.
     """
-    by_command: dict[str, list[Path]] = {}
-    for path in fields:
-        by_command.setdefault(checks.verb_of(contents.record(path)), []).append(path)
     reasons: list[checks.Line] = []
+    by_command, faulty = _by_command(contents, fields), set()
     for number, paths in enumerate(by_command.values()):
         found = [each for path in paths for each in checks.of_vectors(fields[path], path.name)]
         against = [each for each in found if each.verdict != "good"]
-        reasons += [replace(each, verdict="good") if number else each for each in against[:MOST_FIELDS]]
-        if len(against) > MOST_FIELDS:
-            text = f"{len(against) - MOST_FIELDS} more reasons like these in other files"
+        warned = checks.of_warnings({str(path): contents.record(path) for path in paths})
+        faulty |= {path for path in paths if checks.worst([*against, *warned], "good") != "good"}
+        reasons += [replace(each, verdict="good") if number else each for each in against[:MOST_REASONS]]
+        if len(against) > MOST_REASONS:
+            text = f"{len(against) - MOST_REASONS} more reasons like these in other files"
             reasons.append(checks.Line("vectors", "good" if number else "look", text))
         reasons += [each for each in found if each.verdict == "good"][:1]
     if all(len(paths) == 1 for paths in by_command.values()):
-        for one, other in combinations(fields, 2):
-            reasons += checks.of_two_ways(fields[one], fields[other], (one.name, other.name))
+        for one, other in combinations([path for paths in by_command.values() for path in paths], 2):
+            differ = checks.of_two_ways(fields[one], fields[other], (one.name, other.name))
+            # From vectors that are told to be poor others may differ.
+            reasons += [replace(each, verdict="good") if {one, other} & faulty else each for each in differ]
     return reasons
 
 
 def _chain(contents: Contents, fields: Fields, drawer: Drawer) -> Iterable[Section]:
     """Yield the sections of vectors, tracks, images and calibration, as far as they are there."""
+    groups, pictures = _by_command(contents, fields), list[Picture]()
     if fields:
-        best, *others = fields
-        text, table = _batch_table(fields, len(contents.of("vectors")), map(_field_row, fields.values()))
-        if others and np.isfinite(_sigma(fields[best])):
-            text = (*text, f"The smallest stated errors are those of {best.name}, the first in the table.")
-        pictures = drawer.pictures(best)
-        for path in others[: MOST_FIELDS - 1]:
-            pictures += drawer.pictures(path, only=OF_OTHERS)
-        yield Section("Vectors", "vectors", text, (table,), tuple(pictures))
+        paths = [path for group in groups.values() for path in group]
+        count = len(contents.of("vectors"))
+        text, table = _batch_table(paths[:LONGEST_TABLE], count, (_field_row(fields[path]) for path in paths))
+        for number, group in enumerate(groups.values()):
+            if len(group) > 1:
+                pictures += drawer.of_batch({path.stem: fields[path] for path in group})
+            else:
+                pictures += drawer.pictures(group[0], only=OF_OTHERS if number else OF_VECTORS)
+        yield Section("Vectors", "vectors", text, tables=(table,), pictures=tuple(pictures))
     for path in contents.of("tracks")[:1]:
         points = open_tracks(path)
         view = _view(points) if has_views() and len(points.position_mm) else ""
-        text = (f"The view can be turned; it shows at most {MOST_LINES} tracks.",) if view else ()
-        yield Section("Tracks", "tracks", text, (), tuple(drawer.pictures(path)), view=view)
+        text = (f"The view can be turned; it shows at most {MOST_LINES} tracks of {path.name}.",) if view else ()
+        pictures = drawer.pictures(path, only=OF_TRACKS)
+        # On a screen the view shows what the first one does.
+        pictures = [replace(each, on_paper=bool(view) and not number) for number, each in enumerate(pictures)]
+        yield Section("Tracks", "tracks", text, pictures=tuple(pictures), view=view)
     for kind, title, rows_of in (("particles", "Particles", _particle_row), ("volumes", "Volumes", _volume_row)):
         paths = contents.of(kind)
         if paths:
-            shown = paths[:LONGEST_TABLE]
+            shown = paths[:LONGEST_OTHER]
             text, table = _batch_table(shown, len(paths), map(rows_of, shown))
-            role = "image" if kind == "particles" else ""
-            yield Section(title, kind, text, (table,), tuple(drawer.pictures(paths[0], role)))
+            role, only = ("image", OF_PARTICLES) if kind == "particles" else ("", OF_VOLUMES)
+            pictures = drawer.pictures(paths[0], role, only)
+            yield Section(title, kind, text, tables=(table,), pictures=tuple(pictures))
     for path in contents.of("calibration")[:1]:
-        summary = open_calibration(path).summary()
-        rows = tuple((name, _cell(value)) for name, value in summary.items() if value is not None)
-        table = Table("What the white image and the board show", ("figure", "value"), rows)
-        pictures = drawer.pictures(path, "white")
-        # That `calibrate-snapshot --picture` has put beside it.
-        if (beside := path.with_suffix(".png")).is_file():
-            pictures = [Picture(beside, "lens images and board, as found"), *pictures]
-        yield Section("Calibration", "calibration", (), (table,), tuple(pictures))
+        table = Table("What the white image and the board show", ("figure", "value"), _with_sigmas(path))
+        # That `calibrate-snapshot --picture` has put beside it shows all.
+        beside = path.with_suffix(".png")
+        found = [Picture(beside, "Lens images and board, as found")] if beside.is_file() else []
+        pictures = found or drawer.pictures(path, "white")
+        yield Section("Calibration", "calibration", tables=(table,), pictures=tuple(pictures))
     for path in contents.of("weights")[:1]:
-        yield Section("Weights", "weights", pictures=tuple(drawer.pictures(path)))
+        yield Section("Weights", "weights", pictures=tuple(drawer.pictures(path, only=OF_WEIGHTS)))
+
+
+def _with_sigmas(calibration: Path) -> tuple[tuple[str, str], ...]:
+    """Return the figures of a calibration that are known, each with its standard error."""
+    summary = {name: value for name, value in open_calibration(calibration).summary().items() if value is not None}
+    rows = []
+    for name, value in summary.items():
+        base = name.removesuffix("_sigma")
+        if base == name or base not in summary:
+            sigma = summary.get(f"{name}_sigma")
+            rows.append((name, _cell(value) if sigma is None else f"{_cell(value)} ± {readable(sigma, digits=2)}"))
+    return tuple(rows)
 
 
 def _sigma(field: VectorField) -> float:
@@ -347,12 +461,13 @@ def _with_error(reported: Mapping[str, Any], name: str, unit: str) -> str:
 
 def _field_row(vectors: VectorField) -> Row:
     quality, there, used = checks.quality_of(vectors), vectors.flag < REJECTED, vectors.flag < MASKED
-    moved = vectors.displacement_voxel[there]
+    moved, (mean, sigma) = vectors.displacement_voxel[there], checks.velocity_of(vectors)
     return {
         "vectors": str(quality.used),
         "valid": f"{np.mean(vectors.flag[used] == VALID):.1%}" if used.any() else UNKNOWN,
-        "median u, v, w (voxel)": _cell(np.median(moved, axis=0).tolist()) if len(moved) else UNKNOWN,
-        "median sigma (voxel)": _cell(quality.summary()["uncertainty_voxel_median"]),
+        "mean u, v, w (m/s)": _cell(mean.tolist()) if np.isfinite(mean).all() else UNKNOWN,
+        "usual σ of one (m/s)": readable(sigma.tolist(), digits=2) if np.isfinite(sigma).all() else UNKNOWN,
+        "median moved (voxel)": _cell(np.median(moved, axis=0).tolist()) if len(moved) else UNKNOWN,
     }
 
 
@@ -376,20 +491,33 @@ def _records(contents: Contents) -> Iterable[Section]:
         for warning in made.get("warnings", ())
     ]
     if warned:
-        table = Table("As they were made", ("file", "command", "code", "warning"), tuple(warned[:LONGEST_TABLE]))
+        table = Table("As they were made", ("file", "command", "code", "warning"), tuple(warned[:LONGEST_OTHER]))
         yield Section("Warnings", "warnings", tables=(table,))
     last = contents.last
     if last.get("config"):
-        settings = yaml.safe_dump(last["config"], sort_keys=False, allow_unicode=True, default_flow_style=None)
+        settings = yaml.safe_dump(_given(last["config"]), sort_keys=False, allow_unicode=True, default_flow_style=None)
         yield Section("Settings", "settings", commands=tuple(settings.splitlines()))
-    inputs = [
-        (name, str(made.get("command")), f"{role} {given['name']}", given["sha256"][:16])
-        for name, made in contents.all_records.items()
-        for role, given in made.get("inputs", {}).items()
+    # Each input once, with the first that is made from it.
+    used: dict[tuple[str, str], list[str]] = {}
+    for name, made in contents.all_records.items():
+        for role, given in made.get("inputs", {}).items():
+            used.setdefault((f"{role} {given['name']}", given["sha256"][:16]), []).append(name)
+    rows = [
+        (*given, f"{first} and {len(others)} more" if others else first) for given, (first, *others) in used.items()
     ]
     libraries = ", ".join(f"{name} {version}" for name, version in last.get("libraries", {}).items())
-    table = Table("Made from", ("file", "command", "input", "SHA-256 begins"), tuple(inputs[:LONGEST_TABLE]))
-    yield Section("Provenance", "provenance", (f"lfpiv {last.get('version')}; {libraries}.",), (table,))
+    left = f" The first {LONGEST_OTHER} of {len(rows)} inputs; info tells those of a file."
+    text = f"lfpiv {last.get('version')}; {libraries}.{left if len(rows) > LONGEST_OTHER else ''}"
+    table = Table("Made from", ("input", "SHA-256 begins", "for"), tuple(rows[:LONGEST_OTHER]))
+    yield Section("Provenance", "provenance", (text,), tables=(table,))
+
+
+def _given(settings: Any) -> Any:
+    """Return settings without those that are not given."""
+    if isinstance(settings, dict):
+        kept = {name: _given(value) for name, value in settings.items() if value is not None}
+        return {name: value for name, value in kept.items() if value != {}}
+    return [_given(each) for each in settings] if isinstance(settings, list) else settings
 
 
 def _cell(value: Any) -> str:
