@@ -1,4 +1,4 @@
-"""The drawing of the light's way, as SVG: rays from a point in the fluid to the sensor, and from its equivalent point.
+"""Drawings as SVG: the light's way from a point in the fluid, or its equivalent point, to the sensor; a pipe's board.
 
 The lengths along the axis are chosen for the eye; the refractions are Snell's law with the paper's indices, and the
 lenses are thin ones, so that the rays meet where they should.
@@ -22,10 +22,78 @@ def light() -> str:
     for share in (-0.9, -0.45, 0.45, 0.9):
         parts += _ray(share * APERTURE)
     parts += [_dot(FOCUS, REAL), _dot(_equivalent(0.45 * APERTURE), EQUIVALENT), *_labels()]
-    head = f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {WIDTH:g} {HEIGHT:g}" role="img">'
-    title = "<title>Rays from a point in the fluid through window, air, main lens and microlens to the sensor</title>"
-    ground = f'<rect width="{WIDTH:g}" height="{HEIGHT:g}" fill="#ffffff"/>'
-    return "\n".join([head, title, ground, *parts, "</svg>"]) + "\n"
+    title = "Rays from a point in the fluid through window, air, main lens and microlens to the sensor"
+    return _svg(WIDTH, HEIGHT, title, parts)
+
+
+def _svg(width: float, height: float, title: str, parts: list[str]) -> str:
+    """Return a drawing of its parts."""
+    head = f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width:g} {height:g}" role="img">'
+    ground = f'<rect width="{width:g}" height="{height:g}" fill="#ffffff"/>'
+    return "\n".join([head, f"<title>{title}</title>", ground, *parts, "</svg>"]) + "\n"
+
+
+# The pipes of configs/pipe.yaml and pipe_box.yaml, in mm, and how many units of the drawing these are.
+OUTER_MM, INNER_MM, BOX_MM, BOX_WALL_MM, UNITS_PER_MM = 7.0, 5.0, 13.0, 3.0, 9.0
+BOARD_MM, PIPE_AT, LENS_AT = 1.2, 190.0, 560.0
+
+
+def board_of_a_pipe() -> str:
+    """Return where the board of a pipe stands, alone and in a box, and how far the camera then moves; light goes right.
+
+    The moves are to scale: what lies between board and axis, each part over its refractive index.
+    """
+    wall = (OUTER_MM - INNER_MM) / WINDOW + INNER_MM / FLUID
+    box = BOX_WALL_MM / WINDOW + (BOX_MM - BOX_WALL_MM - OUTER_MM) / FLUID + wall
+    parts = [*_pipe_row(150.0, OUTER_MM, BOARD_MM + wall), *_pipe_row(430.0, BOX_MM, BOARD_MM + box)]
+    return _svg(820.0, 600.0, "Boards on a pipe and on its box, and the camera's move after their picture", parts)
+
+
+def _pipe_row(middle: float, front_mm: float, move_mm: float) -> list[str]:
+    """Return a pipe's section, its box if its front is not the pipe's own, the board on it, and the camera's places."""
+
+    def circle(radius_mm: float, fill: str) -> str:
+        drawn = f'r="{radius_mm * UNITS_PER_MM:g}" fill="{fill}" stroke="{INK}"'
+        return f'<circle cx="{PIPE_AT:g}" cy="{middle:g}" {drawn}/>'
+
+    def square(half_mm: float, fill: str) -> str:
+        half = half_mm * UNITS_PER_MM
+        place = f'x="{PIPE_AT - half:g}" y="{middle - half:g}" width="{2 * half:g}" height="{2 * half:g}"'
+        return f'<rect {place} fill="{fill}" stroke="{INK}"/>'
+
+    def lens(at: float, colour: str, dashes: str) -> str:
+        dash = f' stroke-dasharray="{dashes}"' if dashes else ""
+        drawn = f'fill="none" stroke="{colour}"{dash}/>'
+        shape = f'<ellipse cx="{at:.1f}" cy="{middle:g}" rx="9" ry="62" {drawn}'
+        return shape + f'<rect x="{at + 22:.1f}" y="{middle - 45:g}" width="110" height="90" {drawn}'
+
+    fluid, window = "#dbeafe", "#93b4de"
+    boxed = front_mm > OUTER_MM
+    front, move = PIPE_AT + front_mm * UNITS_PER_MM, move_mm * UNITS_PER_MM
+    focus = front + BOARD_MM * UNITS_PER_MM
+    board = f'<rect x="{front:g}" y="{middle - 50:g}" width="{focus - front:g}" height="100" fill="{EQUIVALENT}"/>'
+    faces = [circle(OUTER_MM, window), circle(INNER_MM, fluid)]
+    if boxed:
+        faces = [square(front_mm, window), square(front_mm - BOX_WALL_MM, fluid), *faces]
+    axis = f'<path d="M20 {middle:g} H790" stroke="#94a3b8" stroke-dasharray="10 4 2 4"/>'
+    before = [(LENS_AT, 55.0), (focus, 0.0), (LENS_AT, -55.0)]
+    lines = [
+        f'<polyline points="{" ".join(f"{x:.1f},{middle - y:.1f}" for x, y in before)}" fill="none" '
+        f'stroke="{EQUIVALENT}" stroke-dasharray="5 4"/>',
+        f'<circle cx="{PIPE_AT:g}" cy="{middle:g}" r="4" fill="{REAL}"/>',
+    ]
+    at, end, tick = middle + 88.0, LENS_AT - move, f"V{middle + 93:g}"
+    ends = f"M{LENS_AT:.1f} {at - 14:g} {tick} M{end:.1f} {at - 14:g} {tick}"
+    arrow = f'<path d="{ends} M{LENS_AT:.1f} {at:g} H{end:.1f} m8 -4 l-8 4 l8 4" stroke="{INK}" fill="none"/>'
+    words = [
+        _text(PIPE_AT, middle - front_mm * UNITS_PER_MM - 12, "box, water and pipe" if boxed else "pipe"),
+        _text(front + 62, middle - 58, "board", colour=EQUIVALENT),
+        _text(PIPE_AT, middle + 24, "focus after", colour=REAL),
+        _text(LENS_AT + 77, middle - 80, "camera: focused on the board", colour=EQUIVALENT),
+        _text(LENS_AT + 77, middle + 78, "then nearer by d", "m", REAL),
+    ]
+    camera = [lens(LENS_AT, EQUIVALENT, "5 4"), lens(end, REAL, ""), arrow]
+    return [*faces, axis, board, *lines, *camera, *words]
 
 
 def _slopes(height: float) -> tuple[float, float, float]:

@@ -1,8 +1,8 @@
 """What these documents take from the code and from the sample, made anew when either has changed.
 
 Everything goes into `docs/_generated`, which is not kept: the sample's chain with its pictures and what it prints, a
-page for each command, the Python interface, the tree of the package, the drawing of the light's way, and a tracer's
-light by rays and waves.
+page for each command, the Python interface, the tree of the package, the drawings of the light's way and of a pipe's
+board, and a tracer's light by rays and waves.
 """
 
 from __future__ import annotations
@@ -63,6 +63,7 @@ def everything() -> None:
     """Make all that is generated."""
     GENERATED.mkdir(exist_ok=True)
     (GENERATED / "light.svg").write_text(drawing.light(), encoding="utf-8")
+    (GENERATED / "pipe_board.svg").write_text(drawing.board_of_a_pipe(), encoding="utf-8")
     light_figure.write_figure(ROOT / "configs" / "table2.yaml", GENERATED / "light_by_waves.png")
     (GENERATED / "tree.md").write_text("\n".join(tree()) + "\n", encoding="utf-8")
     (GENERATED / "interface.md").write_text("\n".join(interface()) + "\n", encoding="utf-8")

@@ -311,3 +311,16 @@ def test_a_point_off_the_axis_comes_back_to_its_place(
     assert off[0] == pytest.approx(bend[0] * np.hypot(*true[:2]) ** 3, rel=0.3)
     # The adjoint is a blur as wide as a microlens, 0.1 mm; its middle is known to a tenth of that.
     assert off[1] < 0.2 * off[0]
+
+
+@pytest.mark.parametrize(("name", "radius"), [("pipe", 7.0), ("pipe_box", 13.0)])
+def test_the_camera_is_moved_from_a_pipes_board_to_its_axis_as_the_recipe_says(name: str, radius: float) -> None:
+    """The recipe's figures, from a board on the outermost face or in the axis's place, are the scene's own."""
+    root = Path(__file__).parent.parent
+    settings = load_rig(root / "configs" / f"{name}.yaml")
+    space, camera = settings.scene_space(), settings.camera_model()
+    assert space is not None
+    to_face = space.shapes()[0].vertex_mm[2] - space.lens_z_mm(camera)
+    move, recipe = camera.focus_distance_mm - to_face, (root / "docs" / "curved-windows.md").read_text(encoding="utf-8")
+    assert f"{move:.3f} mm" in recipe
+    assert f"{move:.3f} − {radius:g} = −{radius - move:.3f} mm" in recipe

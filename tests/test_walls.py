@@ -15,7 +15,7 @@ from lfpiv_cli.optics.shapes import HeightMap, RigidMotion
 from lfpiv_cli.optics.surfaces import Cylinder, Plane, Sphere, Surface, TiltedPlane
 from lfpiv_cli.particles.fitting import add_all
 from lfpiv_cli.particles.noise import Noise
-from lfpiv_cli.particles.view import raw_view
+from lfpiv_cli.particles.view import raw_view, with_radius
 from lfpiv_cli.self_calibration.nuisances import MovableScene, Nuisances, fit_nuisances, moved_places
 from lfpiv_cli.self_calibration.refinement import Refinement
 from lfpiv_cli.self_calibration.scene_refinement import SceneRefinement, wall_by_places
@@ -268,6 +268,8 @@ def test_what_is_told_and_shown_of_a_scene(scene: MovableScene, rng: np.random.G
     np.testing.assert_allclose(figures["axis_point_mm"], (0.0, *found.axis[:2]), atol=1e-12)
     direction = np.array(figures["axis_direction"])
     np.testing.assert_allclose(direction[1:] / direction[0], np.tan(found.axis[2:]), rtol=1e-3)
+    # The lens stays where it is: of 0.2 mm nearer, 1 - 1/1.33 are the focal point's.
+    assert figures["focal_point_shift_mm"] == pytest.approx(-found.axis[1] * (1.0 - 1.0 / 1.33), abs=5e-4)
     pose = found.pose(None, "of these faces")
     assert scene.space.moved(pose.motion) == scene.moved(found.axis)
     assert pose.shift_sigma_mm[0] == pose.turn_sigma_deg[0] == 0.0
@@ -289,17 +291,40 @@ def test_what_is_told_and_shown_of_a_scene(scene: MovableScene, rng: np.random.G
     assert counted.get_xlim()[0] < found.wall.radius_mm < counted.get_xlim()[1]
 
 
+@pytest.mark.parametrize("axis", [(1, 0, 0), (-1, 0.02, 0), (0, 1, 0), (0, -1, 0.03), (0.7, -0.7, 0.1)])
+def test_shifts_and_tilts_across_and_away_have_the_signs_of_x_or_y_and_of_z(
+    config: Config, axis: tuple[float, float, float]
+) -> None:
+    space = config.scene_space()
+    assert space is not None
+    faces = tuple(Face(Cylinder((0.0, 0.0, 0.0), axis, each), n) for each, n in ((7.0, 1.49), (5.0, 1.33)))
+    scene = MovableScene.of(replace(space, faces=faces), config.camera_model())
+    assert scene.across[np.argmax(np.abs(scene.across))] > 0.0 < scene.away[2]
+    shifted = scene.motion(np.array([0.1, 0.2, 0.0, 0.0])).points(scene.pivot_mm) - scene.pivot_mm
+    np.testing.assert_allclose(shifted, 0.1 * scene.across + 0.2 * scene.away, atol=1e-15)
+    turned = scene.motion(np.array([0.0, 0.0, 1e-3, 2e-3])).directions(scene.along) - scene.along
+    np.testing.assert_allclose(turned, 1e-3 * scene.across + 2e-3 * scene.away, atol=5e-6)
+
+
 @pytest.mark.thorough
-def test_images_tell_where_a_pipe_lies(config: Config, rng: np.random.Generator) -> None:
+def test_images_tell_where_a_pipe_lies(config: Config) -> None:
     """Light of particles behind a pipe that lies elsewhere is explained by no other place of theirs."""
+    rng = np.random.default_rng(3)
     camera, space = replace(config.camera_model(), columns=900, rows=350), config.scene_space()
     assert space is not None
     scene, depths = MovableScene.of(space, camera), (-5.3, 5.3)
     view = raw_view(camera, space.media, 0.025, None, space)
     truth = Nuisances.of(np.concatenate([np.zeros(5), 0.3 * TRUTH]))
     places = np.column_stack([rng.uniform((-1.5, -0.7, -4.5), (1.5, 0.7, 4.5), (60, 3)), rng.uniform(4e5, 6e5, 60)])
-    noise, image = Noise(6.0, 2.0), np.zeros(camera.rows * camera.columns)
+    noise, image = Noise(2.0, 0.2), np.zeros(camera.rows * camera.columns)
     add_all(truth.applied(view, scene), places, 1.0, image, depths)
+    # Of tracers cut by the wall on one side there is a smaller part, and no place of a whole one looks like it.
+    across = rng.uniform(0.5, 1.4, 16)
+    own = np.column_stack([rng.uniform(-0.7, 0.7, 16), across, np.sqrt(4.982**2 - across**2)])
+    at_wall = scene.on_axis(np.zeros(1), truth.scene) + own @ scene.frame(truth.scene)
+    cut = np.column_stack([scene.camera.to_image_axes(at_wall), np.full(16, 3e5)])
+    add_all(with_radius(truth.applied(view, scene), 0.012), cut, 1.0, image, depths)
+    places = np.concatenate([places, cut])
     image += rng.normal(0.0, np.sqrt(noise.read_counts**2 + noise.gain_counts * image))
     faces = scene.faces(truth.scene), scene.faces(np.zeros(4))
     start = places.copy()
@@ -307,5 +332,7 @@ def test_images_tell_where_a_pipe_lies(config: Config, rng: np.random.Generator)
     fit = fit_nuisances(image, view, start, noise, depths, scene)
     off = fit.found.scene - truth.scene
     assert np.all(np.abs(off) < 4.0 * fit.sigma.scene)
+    # Measured: 0.001 mm; 0.012 to 0.016 of two seeds in three if those at the wall were believed.
+    assert np.all(np.abs(off[:2]) < 0.004)
     assert np.all(np.abs(truth.scene[:2]) > 5.0 * fit.sigma.scene[:2])
     assert np.median(np.abs(fit.particles[:, 2] - places[:, 2])) < 0.02

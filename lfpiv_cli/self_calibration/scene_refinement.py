@@ -111,19 +111,24 @@ class SceneRefinement:
         """Whether wall and images tell of the same scene."""
         return self.disagreement < AGREEING_CHI2
 
+    @property
+    def focal_point_shift_mm(self) -> float:
+        """How far the focal point, from which z is counted, comes to lie further from the camera."""
+        before, after = (space.lens_z_mm(self.camera) for space in (self.scene.space, self.scene.moved(self.axis)))
+        return before - after
+
     def pose(self, before: ScenePose | None, faces_sha256: str) -> ScenePose:
         """Return where the scene lies, from the config's, which was moved by `before`."""
         motion, scene = self.scene.motion(self.axis), self.scene
         if before is not None:
             motion = before.motion.then(motion)
         shift = np.stack([scene.across, scene.away], axis=1)
-        turn = np.stack([scene.away, -scene.across], axis=1)
         return ScenePose(
             shift_mm=np.array(motion.shift_mm),
             turn_deg=np.rad2deg(motion.turn_rad),
             pivot_mm=np.array(motion.pivot_mm),
             shift_sigma_mm=_spread(shift, self.covariance[:2, :2]),
-            turn_sigma_deg=np.rad2deg(_spread(turn, self.covariance[2:, 2:])),
+            turn_sigma_deg=np.rad2deg(_spread(scene.turns.T, self.covariance[2:, 2:])),
             faces_sha256=faces_sha256,
         )
 
@@ -147,6 +152,7 @@ class SceneRefinement:
             "particles_at_wall": self.wall.particles,
             "axis_point_mm": motion.points(self.scene.pivot_mm).tolist(),
             "axis_direction": motion.directions(self.scene.along).tolist(),
+            "focal_point_shift_mm": self.focal_point_shift_mm,
             **_told("axis", self.axis, np.sqrt(np.diag(self.covariance))),
             **_told("axis_by_wall", self.by_wall, wall),
             **_told("axis_by_images", images, images_sigma),
