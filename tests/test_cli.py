@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import subprocess
 import sys
 import time
 from pathlib import Path
 
+import click
 import pytest
 
+from lfpiv_cli.cli.main import cli
+from lfpiv_cli.cli.options import GROUPS
 from lfpiv_cli.files import kernel_cache
 from tests.commands import AT_FOCUS, CONFIG, ROOT, SAMPLE, sample_rig
 
@@ -24,6 +28,44 @@ def lfpiv(*arguments: object, **options: object) -> subprocess.CompletedProcess[
 def test_nothing_heavy_is_imported_for_help_or_by_a_script(module) -> None:
     script = f"import sys, {module}; print(sorted({{'numpy', 'numba', 'h5py', 'scipy'}} & set(sys.modules)))"
     assert subprocess.run([sys.executable, "-c", script], capture_output=True, text=True).stdout.strip() == "[]"
+
+
+def groups_of(name: str) -> dict[str, list[str]]:
+    """Return the options of a command's help, those of several names by the last, under their headings."""
+    context = click.Context(cli, info_name="lfpiv")
+    command = cli.get_command(context, name)
+    assert command is not None
+    found: dict[str, list[str]] = {}
+    for line in command.get_help(click.Context(command, parent=context, info_name=name)).splitlines():
+        if line.endswith(":") and not line.startswith(" "):
+            found[line[:-1]] = []
+        elif (option := re.match(r"  (?:-\w, )?--([\w-]+)", line)) and found:
+            list(found.values())[-1].append(option[1])
+    return found
+
+
+@pytest.mark.parametrize("name", cli.list_commands(click.Context(cli)))
+def test_help_has_each_option_once_under_what_it_is_about(name: str) -> None:
+    found = groups_of(name)
+    command = cli.commands[name]
+    options = [each for each in command.get_params(click.Context(command)) if isinstance(each, click.Option)]
+    listed = [each for names in found.values() for each in names]
+    assert sorted(listed) == sorted(option.opts[-1].removeprefix("--") for option in options)
+    assert [title for title in GROUPS if title in found] == list(found)
+    assert {"json", "quiet", "threads", "help"} <= set(found["What it prints, and on what it runs"])
+
+
+def test_batches_have_one_heading_and_defaults_are_shown() -> None:
+    batch = {"pairing", "pair-by", "pairs", "resume", "keep-going", "failures", "shard", "time-limit", "dry-run"}
+    for name in ("run", "reconstruct", "correlate", "track"):
+        assert batch <= set(groups_of(name)["Pairs and batches"])
+    assert {"white", "dark", "board"} <= set(groups_of("run")["What it needs"])
+    assert set(groups_of("reconstruct")["How"]) == {"solver", "iterations", "relaxation", "accelerate", "start"}
+    words = " ".join(cli.commands["run"].get_help(click.Context(cli.commands["run"], info_name="run")).split())
+    assert "By what the flow is measured. [default: (auto)]" in words
+    # What a group names is an option of some command.
+    known = {str(each.name) for command in cli.commands.values() for each in command.params} | {"help"}
+    assert {name for names in GROUPS.values() for name in names.split()} <= known
 
 
 @pytest.mark.thorough

@@ -10,12 +10,14 @@ from typing import Any
 import click
 
 from lfpiv_cli.cli.options import (
+    CONFIGS,
     FILE,
     POSITIVE,
     background_option,
     batch_options,
     board_option,
     calls,
+    command,
     common_options,
     config_argument,
     dark_option,
@@ -43,7 +45,7 @@ def particles_in(folder: Path) -> tuple[Path, ...]:
     return tuple(expanded([folder], "results"))
 
 
-@click.command("field")
+@command("field")
 @click.argument("samples", type=FILE, nargs=-1, required=True)
 @dt_option
 @click.option(
@@ -78,19 +80,21 @@ def field() -> None:
     """
 
 
-@click.command("track")
+@command("track")
 @inputs_argument("particles", "results")
 @dt_option
 @click.option(
     "--search",
     "search_voxel",
     type=POSITIVE,
-    help="Largest displacement, voxels; found from the particles when not given.",
+    show_default="found from the particles",
+    help="Largest displacement, voxels.",
 )
 @click.option(
     "--shortest",
     type=click.IntRange(min=2),
-    help="Sequence: fewest frames of a track, shorter ones are ghosts; 3 when not given.",
+    show_default="3",
+    help="Sequence: fewest frames of a track, shorter ones are ghosts.",
 )
 @click.option("--grid", is_flag=True, help="Also write vectors on correlate's grid, as OUTPUT's name with _grid.")
 @click.option(
@@ -120,7 +124,7 @@ def track() -> None:
     """
 
 
-@click.command("follow")
+@command("follow")
 @click.argument("weights", type=FILE)
 @inputs_argument("frames")
 @dark_option
@@ -131,10 +135,11 @@ def track() -> None:
     "--search",
     "search_voxel",
     type=POSITIVE,
-    help="Largest displacement from the first frame to the second, voxels; found from the particles when not given.",
+    show_default="found from the particles",
+    help="Largest displacement from the first frame to the second, voxels.",
 )
 @click.option(
-    "--shortest", type=click.IntRange(min=2), default=4, help="Fewest frames of a track, shorter ones are ghosts; 4."
+    "--shortest", type=click.IntRange(min=2), default=4, help="Fewest frames of a track, shorter ones are ghosts."
 )
 @click.option(
     "--both-ways", is_flag=True, help="Go a second time through the frames, each by its tracks before and after it."
@@ -179,7 +184,7 @@ def parse_windows(text: str) -> tuple[int | tuple[int, ...], ...]:
     return tuple(windows)
 
 
-@click.command("correlate")
+@command("correlate")
 @inputs_argument("volumes", "results")
 @click.option("--config", type=FILE, help="In place of the config carried by the volumes.")
 @dt_option
@@ -219,7 +224,7 @@ def correlate() -> None:
     """
 
 
-@click.command("combine")
+@command("combine")
 @click.argument("vectors_a", type=FILE)
 @click.argument("vectors_b", type=FILE)
 @output_option("File of combined vectors to write (.vtkhdf).")
@@ -247,7 +252,7 @@ def named_images(command: Callable[..., Any]) -> Callable[..., Any]:
     return run
 
 
-@click.command("run")
+@command("run")
 @config_argument
 @named_images
 @inputs_argument("images")
@@ -258,7 +263,7 @@ def named_images(command: Callable[..., Any]) -> Callable[..., Any]:
 @background_option
 @mask_option
 @click.option(
-    "--method", type=click.Choice(names_in(RunMethod)), help="By what the flow is measured; auto when not given."
+    "--method", type=click.Choice(names_in(RunMethod)), show_default="auto", help="By what the flow is measured."
 )
 @pairing_options
 @dt_option
@@ -267,11 +272,12 @@ def named_images(command: Callable[..., Any]) -> Callable[..., Any]:
 @click.option(
     "--keep",
     type=click.Choice(names_in(Kept)),
-    help="results: drop volumes, and particles of separate pairs, as soon as their vectors stand; all when not given.",
+    show_default="all",
+    help="results: drop volumes, and particles of separate pairs, as soon as their vectors stand.",
 )
 @work_options
 @click.option("--report/--no-report", default=True, help="Make OUTPUT/report.html, a page of all of it.")
-@watch_options("by Ctrl-C when not given")
+@watch_options("by Ctrl-C")
 @output_option("Folder for all that is made.")
 @common_options
 @raw_option
@@ -302,18 +308,19 @@ def run() -> None:
     """
 
 
-@click.command("reconstruct")
+@command("reconstruct")
 @click.argument("weights", type=FILE)
 @inputs_argument("images")
-@click.option("--solver", type=click.Choice(SOLVER_NAMES), help="Of volumes, or particles; default from the config.")
-@click.option("--iterations", type=click.IntRange(min=1), help="Steps of the solver; default from the config.")
+@click.option("--solver", type=click.Choice(SOLVER_NAMES), show_default=CONFIGS, help="Of volumes, or particles.")
+@click.option("--iterations", type=click.IntRange(min=1), show_default=CONFIGS, help="Steps of the solver.")
 @click.option(
     "--relaxation",
     type=click.FloatRange(min=0.0, min_open=True, max=2.0),
-    help="mu of Eq. 12; default from the config.",
+    show_default=CONFIGS,
+    help="mu of Eq. 12.",
 )
-@click.option("--accelerate/--no-accelerate", default=None, help="Extrapolate between steps; default from the config.")
-@click.option("--start", type=click.Choice(names_in(Start)), help="First volume; default from the config.")
+@click.option("--accelerate/--no-accelerate", default=None, show_default=CONFIGS, help="Extrapolate between steps.")
+@click.option("--start", type=click.Choice(names_in(Start)), show_default=CONFIGS, help="First volume.")
 @dark_option
 @background_option
 @mask_option

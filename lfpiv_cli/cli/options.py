@@ -6,7 +6,7 @@ import json
 import os
 import sys
 from collections.abc import Callable, Iterable
-from functools import wraps
+from functools import partial, wraps
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -75,6 +75,45 @@ def printable(message: str) -> str:
     return message.encode("utf-8", "surrogateescape").decode("utf-8", "replace")
 
 
+# What options are about, in the order in which a command's help shows them, by their names; "" are all others.
+GROUPS = {
+    "What it needs": "named files_from raw white dark board depth_mm background mask mask_volume calibration config "
+    "vectors volume particles at pressure",
+    "What it makes": "output picture views report combine grid derived mean residual residuals keep schema to "
+    "overwrite",
+    "How": "",
+    "Pairs and batches": "pairing pair_by pairs watch idle_s resume keep_going failures shard time_limit_s dask "
+    "dry_run",
+    "What it prints, and on what it runs": "as_json verbose quiet log verify threads debug help",
+}
+CONFIGS = "the config's"
+
+
+class Command(click.Command):
+    """A command whose help shows options in groups, and their defaults."""
+
+    def __init__(self, *arguments: Any, **named: Any) -> None:
+        """Have defaults shown."""
+        named["context_settings"] = {"show_default": True, **(named.get("context_settings") or {})}
+        super().__init__(*arguments, **named)
+
+    def format_options(self, context: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write each option under what it is about."""
+        titles = {name: title for title, names in GROUPS.items() for name in names.split()}
+        other = next(title for title, names in GROUPS.items() if not names)
+        shown: dict[str, list[tuple[str, str]]] = {title: [] for title in GROUPS}
+        for option in self.get_params(context):
+            record = option.get_help_record(context) if isinstance(option, click.Option) else None
+            if record is not None:
+                name = "help" if "--help" in option.opts else str(option.name)
+                shown[titles.get(name, other)].append(record)
+        for title, records in shown.items():
+            if records:
+                with formatter.section(title):
+                    formatter.write_dl(records)
+
+
+command = partial(click.command, cls=Command)
 # Whether a file can be read its reader tells: an input's fault, and none of the command line.
 FILE = click.Path(path_type=Path, readable=False)
 POSITIVE = click.FloatRange(min=0.0, min_open=True)
@@ -105,7 +144,7 @@ mask_option = click.option(
     "the images given, brighter than what moves.",
 )
 dt_option = click.option(
-    "--dt-s", type=POSITIVE, help="Time from one frame to the next; default from the config, or the recording."
+    "--dt-s", type=POSITIVE, show_default="the config's, or the recording's", help="Time from one frame to the next."
 )
 resume_option = click.option(
     "--resume", is_flag=True, help="Skip outputs that are complete and made from the same inputs."
@@ -145,7 +184,8 @@ def parsed_by(parse: Callable[[Any], Any]) -> Callable[[click.Context, click.Par
 def watch_options(unless: str) -> Callable[..., Any]:
     """Return the options of folders that are still being filled; `unless` is when they end if that is not given."""
     help_text = "The folders given are still being filled: take files as they become complete, in order."
-    idle = click.option("--idle-s", type=POSITIVE, help=f"With --watch, end so long after the last change; {unless}.")
+    text = "With --watch, end so many seconds after the last change."
+    idle = click.option("--idle-s", type=POSITIVE, show_default=unless, help=text)
     watch = click.option("--watch", is_flag=True, help=help_text)
     return lambda command: watch(idle(command))
 
@@ -284,7 +324,7 @@ def common_options(command: Callable[..., dict[str, Any]]) -> Callable[..., None
     """
 
     @click.option("--overwrite", is_flag=True, help="Replace outputs that exist.")
-    @click.option("--threads", type=click.IntRange(min=1), help="Threads to use; all cores when not given.")
+    @click.option("--threads", type=click.IntRange(min=1), show_default="all cores", help="Threads to use.")
     @click.option(
         "--log", type=FILE, help="Add a line of JSON to this file for each event: start, frame, warning, end, error."
     )

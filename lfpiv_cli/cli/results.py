@@ -12,6 +12,7 @@ from lfpiv_cli.cli.options import (
     FILE,
     POSITIVE,
     calls,
+    command,
     common_options,
     config_argument,
     output_option,
@@ -22,7 +23,7 @@ from lfpiv_cli.console import Console
 from lfpiv_cli.names import ExportFormat, Moment, PaperPart, names_in
 
 
-@click.command("simulate")
+@command("simulate")
 @click.argument("what", type=click.Choice(["white", "board", "particles"]))
 @config_argument
 @click.option("--depth-mm", type=float, multiple=True, help="With board: in the fluid at this depth; repeatable.")
@@ -60,7 +61,7 @@ TAKEN: dict[str, set[str]] = {
 NEEDED = {"volume": ("volume", "particles", "frame")}
 
 
-@click.command("validate")
+@command("validate")
 @click.argument("what", type=click.Choice(list(TAKEN)))
 @click.argument("config", type=FILE, required=False)
 @click.option("--vectors", type=FILE, help="flow: vectors to judge, not those of a simulation.")
@@ -112,7 +113,7 @@ def validate(
     return cast(dict[str, Any], stage(config, output, **common, **chosen))
 
 
-@click.command("report")
+@command("report")
 @click.argument("folder", type=FILE)
 @click.option("--raw", type=FILE, multiple=True, help="Raw images, white ones too, to show what was found on them.")
 @output_option("Page to write (.html).")
@@ -130,7 +131,7 @@ def report() -> None:
     """
 
 
-@click.command("export")
+@command("export")
 @click.argument("files", type=FILE, nargs=-1, required=True)
 @click.option("--to", type=click.Choice(names_in(ExportFormat)), required=True, help="Format to write.")
 @click.option("--plane", type=click.IntRange(min=0), help="Only this plane across z, counted from 0.")
@@ -159,7 +160,7 @@ def export() -> None:
     """
 
 
-@click.command("info")
+@command("info")
 @click.argument("file", type=FILE)
 @click.option("--picture", type=FILE, help="weights: picture of one voxel's pixels to write (.png).")
 @click.option("--voxel", type=int, nargs=3, metavar="IX IY IZ", help="weights: which voxel; default the middle one.")
@@ -176,7 +177,7 @@ def info() -> None:
     """
 
 
-@click.command("plot")
+@command("plot")
 @click.argument("file", type=FILE)
 @output_option("PDF with a page for each figure, or PNG: one figure, or of several P_NAME.png for each.")
 @click.option("--only", multiple=True, metavar="NAME", help="This figure only; may be repeated. Default: all.")
@@ -194,8 +195,8 @@ def plot() -> None:
     """
 
 
-@click.command("warm-up")
-@click.option("--cache", type=FILE, help="Folder to fill; where lfpiv keeps compiled code when not given.")
+@command("warm-up")
+@click.option("--cache", type=FILE, show_default="where lfpiv keeps compiled code", help="Folder to fill.")
 @common_options
 def warm_up(overwrite: bool, console: Console, cache: Path | None = None) -> dict[str, Any]:
     """Compile all that lfpiv would compile when it is used for the first time, in a minute or two.

@@ -10,10 +10,12 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 
 from lfpiv_cli.cli.options import (
+    CONFIGS,
     FILE,
     POSITIVE,
     board_option,
     calls,
+    command,
     common_options,
     config_argument,
     dark_option,
@@ -30,14 +32,17 @@ if TYPE_CHECKING:
     from lfpiv_cli.files.rig_numbers import RigNumbers
 
 
-@click.command("build-weights")
+@command("build-weights")
 @config_argument
 @click.option("--calibration", type=FILE, help="From calibrate-snapshot; without it the data sheet holds.")
 @click.option(
-    "--method", type=click.Choice(names_in(Method)), help="Equivalent, traced or fitted rays; default from the config."
+    "--method",
+    type=click.Choice(names_in(Method)),
+    show_default=CONFIGS,
+    help="Equivalent, traced or fitted rays.",
 )
-@click.option("--refraction", type=click.Choice(names_in(Refraction)), help="Snell's law; default from the config.")
-@click.option("--sampling", type=click.Choice(names_in(Sampling)), help="Integrals or rays; default from the config.")
+@click.option("--refraction", type=click.Choice(names_in(Refraction)), show_default=CONFIGS, help="Snell's law.")
+@click.option("--sampling", type=click.Choice(names_in(Sampling)), show_default=CONFIGS, help="Integrals or rays.")
 @click.option("--dry-run", is_flag=True, help="Check everything and estimate time and memory; write nothing.")
 @output_option("Weights file to write (.h5).")
 @common_options
@@ -51,7 +56,7 @@ def build_weights() -> None:
     """
 
 
-@click.command("calibrate-snapshot")
+@command("calibrate-snapshot")
 @config_argument
 @white_option
 @dark_option
@@ -77,7 +82,7 @@ def calibrate_snapshot() -> None:
     """
 
 
-@click.command("refine-calibration")
+@command("refine-calibration")
 @config_argument
 @click.argument("images", type=FILE, nargs=-1, required=True)
 @click.option("--calibration", type=FILE, required=True, help="From calibrate-snapshot.")
@@ -107,7 +112,7 @@ UNITS_MM = {"m": 1e3, "cm": 10.0, "mm": 1.0, "nm": 1e-6, "um": 1e-3, "µm": 1e-3
 Answer = TypeVar("Answer")
 
 
-@click.command("init")
+@command("init")
 @click.argument("config", type=FILE, required=False)
 @click.option("-o", "--output", type=FILE, help="File to write, in place of CONFIG; default rig.yaml.")
 @click.option("--camera", type=click.Choice(names_in(KnownCamera)), help="A published camera, nothing is asked.")
@@ -149,7 +154,7 @@ def init(
     return stage.init(target, stage.InitOptions(**chosen), overwrite=overwrite, console=console)
 
 
-@click.command("check")
+@command("check")
 @config_argument
 @click.argument("images", type=FILE, nargs=-1)
 @click.option("--white", type=FILE, help="White image, which tells where the lens images lie.")
