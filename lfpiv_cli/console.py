@@ -87,11 +87,17 @@ class Console:
             self.say(text)
 
     def summary(self, figures: Mapping[str, Any]) -> None:
-        """Print the figures of a command on stdout, one a line.
+        """Print the figures of a command on stdout, one a line; or its `summary` in words, where it has one.
 
         What there is for several things, as a figure with a value for each or under names like `recorded.ert.error`,
         stands in a table. Of a list of records each has a line, which begins with its first entry.
         """
+        figures = dict(figures)
+        in_words = figures.pop("summary", [])
+        for line in in_words:
+            self.answer(line)
+        if in_words and not self.verbose:
+            return
         blocks = _blocks(dict(_unfolded(figures)))
         first = max([NAME_WIDTH, *(len(name) for block in blocks for name in block)])
         for block in blocks:

@@ -1,6 +1,7 @@
 """`run`: the whole chain at once, gone on with, and what it refuses."""
 
 import json
+import re
 import shutil
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ from lfpiv_cli.verbs.report import report
 from lfpiv_cli.verbs.run_steps import RunOptions
 from tests.commands import SAMPLE, sample_rig
 from tests.commands import run as lfpiv
+from tests.commands import told as told_of
 
 PAIR = SAMPLE / "pair_a.tif", SAMPLE / "pair_b.tif"
 PHOTOGRAPHS = [word for name in ("white", "dark", "board") for word in (f"--{name}", SAMPLE / f"{name}.tif")]
@@ -100,6 +102,28 @@ def test_what_is_done_is_kept_with_its_summary_and_what_is_lost_is_made_again(ag
     run(again / "rig.yaml", again / "out")
     assert (again / "out" / "calibration.png").exists()
     assert states(again)["build-weights"] == "kept"
+
+
+@pytest.mark.thorough
+def test_a_person_is_told_in_m_per_s_what_was_made_and_what_to_open_and_a_program_all(
+    again: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["run", again / "rig.yaml", *PAIR, *PHOTOGRAPHS, "--method", "volumes", "-o", again / "out"]
+    capsys.readouterr()
+    lfpiv(*words)
+    sentence, by, made, kept, after, figures = capsys.readouterr().out.splitlines()
+    size = "3 x 1.8 x 3.6 mm"
+    told_first = rf"\d\d vectors in {size}; u up to 0\.\d+ m/s, known to 0\.\d+ m/s across and 0\.\d+ m/s in depth; .*"
+    assert re.fullmatch(told_first, sentence)
+    assert by.startswith("by volumes: as asked for")
+    assert {"calibration.h5", "weights.h5", "volumes", VECTORS} <= set(kept.removeprefix("kept: ").split(", "))
+    assert made == "made: report.html"
+    assert after == f"open next: {again / 'out' / 'report.html'} in a browser, {again / 'out' / VECTORS} in ParaView"
+    assert figures.startswith("all figures: --json")
+    told = told_of(capsys, *words)
+    assert told["sentence"] == sentence
+    assert told["steps_kept"] == 5
+    assert told["u_sigma_voxel"]["volumes"] > 0.0
 
 
 @pytest.mark.thorough
@@ -334,7 +358,7 @@ def test_the_method_is_what_errs_less(
     count: float | None, method: Any, methods: tuple[str, ...], said: str, tmp_path: Path
 ) -> None:
     settings = stage.load_rig(rig_in(tmp_path))
-    choice = stage._chosen(settings, RunOptions(images=PAIR, method=method), lambda: count)
+    choice = stage.chosen(settings, RunOptions(images=PAIR, method=method), lambda: count)
     assert choice.methods == methods
     assert said in choice.reason
     assert choice.tracers_per_lens == count

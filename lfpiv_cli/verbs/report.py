@@ -165,7 +165,7 @@ def report(
         foot = f"Made by lfpiv {made.get('version')} from the files in {folder.resolve().name}."
         title = _sentence(contents, fields, len(faults))
         write_pages(Page(title, (advice,), (verdict,), tuple(sections), foot), [output], overwrite)
-    return {"files": len(contents.records), "pictures": drawer.count, "verdict": words}
+    return {"sentence": title, "files": len(contents.records), "pictures": drawer.count, "verdict": words}
 
 
 def _by_file(line: checks.Line) -> tuple[bool, list[str | int]]:
@@ -199,14 +199,15 @@ def _sentence(contents: Contents, fields: Fields, faults: int) -> str:
     else:
         return f"No vectors and no tracks are in {contents.folder.resolve().name}; {against}."
     text = f"{number} in {' x '.join(written(side, 2) for side in sides)} mm"
-    speed = np.abs(velocity[np.isfinite(velocity).all(axis=1)])
+    speed, known = (each[np.isfinite(each).all(axis=1)] for each in (np.abs(velocity), sigma))
+    error = np.median(known, axis=0) if len(known) else np.ones(3)
     if len(speed):
         usual = np.percentile(speed, 100.0 - checks.LEFT_OUT_PERCENT, axis=0)
-        text += f"; {'uvw'[int(np.argmax(usual))]} up to {written(usual.max())} m/s"
-    known = sigma[np.isfinite(sigma).all(axis=1)]
+        # The component that is known best for its size: noise may be as large.
+        shown = int(np.argmax(usual / np.maximum(error, np.finfo(float).tiny)))
+        text += f"; {'uvw'[shown]} up to {written(usual[shown])} m/s"
     if len(known):
-        u, v, w = np.median(known, axis=0)
-        text += f", known to {written(max(u, v), 2)} m/s across and {written(w, 2)} m/s in depth"
+        text += f", known to {written(max(error[:2]), 2)} m/s across and {written(error[2], 2)} m/s in depth"
     return f"{text}; {against}."
 
 

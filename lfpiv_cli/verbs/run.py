@@ -35,18 +35,19 @@ from lfpiv_cli.files.provenance import Gone, carried_record, sha256, without_war
 from lfpiv_cli.names import FlowMethod
 from lfpiv_cli.notice import written
 from lfpiv_cli.verbs import build_weights, calibrate, particles
-from lfpiv_cli.verbs.batches import ALL, MB, Expected, Worked, dry_run, estimate
+from lfpiv_cli.verbs.batches import ALL, MB, Expected, Failure, Worked, dry_run, estimate
 from lfpiv_cli.verbs.build_weights import plan_of
 from lfpiv_cli.verbs.calibrate import ensure_pictures
 from lfpiv_cli.verbs.checks import figures_of
 from lfpiv_cli.verbs.correlate import field_bytes
-from lfpiv_cli.verbs.follow import SEQUENCE_IS_WHOLE, follow_particles
+from lfpiv_cli.verbs.follow import SEQUENCE_IS_WHOLE, TRACKS, follow_particles
 from lfpiv_cli.verbs.following import SHORTEST, ensure_sequence
 from lfpiv_cli.verbs.frames import Bench, Read, mask_of, other_frames, read_frame, reader
 from lfpiv_cli.verbs.pairs import image_pairs
 from lfpiv_cli.verbs.report import ReportOptions, report
 from lfpiv_cli.verbs.run_steps import (
     CALIBRATION,
+    KEPT,
     MADE,
     RECORD,
     RESULTS,
@@ -138,17 +139,40 @@ def take_all(chain: Chain) -> dict[str, Any]:
             replacing = chain.overwrite or bool(steps.earlier)
             return report(output, page, ReportOptions(raw=raw), overwrite=replacing, console=steps.console)
 
-        reported |= {"verdict": steps.take("report", [page], make).get("verdict"), "report": str(page)}
+        of_page = steps.take("report", [page], make)
+        reported |= {"sentence": of_page.get("sentence"), "verdict": of_page.get("verdict"), "report": str(page)}
     steps.write(whole=True)
     reported |= steps.summary()
     # By both methods a frame fails twice.
     worked = Worked[None](failures=list(dict.fromkeys(chain.failures)))
     worked.list_failures(options.failures)
+    reported["summary"] = in_words(chain, reported, [*fields.values()][-1], worked.failures)
     if worked.failures:
         first, records = worked.failures[0], [asdict(failure) for failure in worked.failures]
         text = f"{len(records)} frames or pairs failed, the first {first.name}: {first.error}"
         raise PartialError(text, reported | {"failures": records})
     return reported
+
+
+def in_words(chain: Chain, reported: Mapping[str, Any], vectors: Vectors, failures: Sequence[Failure]) -> list[str]:
+    """Return what a person wants to know of a run: what was found, what was made, and what to open next."""
+    steps, output = chain.steps, chain.steps.output
+    found: dict[str, list[str]] = {MADE: [], KEPT: []}
+    for step in steps.reported["steps"].values():
+        names = found[MADE if step["state"] == MADE else KEPT]
+        names += [name for name in dict.fromkeys(file.split("/")[0] for file in step["files"]) if name not in names]
+    files = [f"{state}: {', '.join(names)}" for state, names in found.items() if names]
+    flow = next(iter(vectors.values()), output / TRACKS if chain.options.follow else None)
+    shown = [f"{reported['report']} in a browser"] if "report" in reported else []
+    shown += [f"{flow} in ParaView"] if flow is not None else []
+    return [
+        *filter(None, [reported.get("sentence")]),
+        f"by {reported['method']}: {reported['reason']}",
+        *(f"failed: {failure.name}: {failure.error}" for failure in failures),
+        *files,
+        f"open next: {', '.join(shown)}" if shown else f"all is in {output}",
+        f"all figures: --json, -v, or {output / RECORD}",
+    ]
 
 
 def measured(chain: Chain, choice: Choice, weights: Path) -> dict[str, Vectors]:
