@@ -14,7 +14,10 @@ from lfpiv_cli.fields.spline_field import SplineField, lattice_for
 from lfpiv_cli.fields.stencils import (
     DIVERGENCE,
     SECOND,
+    SECOND_IN_DEPTH,
+    SMOOTHNESS,
     THIRD,
+    THIRD_IN_DEPTH,
     Expectation,
     Lattice,
     bound,
@@ -108,7 +111,8 @@ def test_smoothness_does_not_see_polynomials_of_lower_degree(order: int, free: i
         coefficients = np.linalg.lstsq(design, values, rcond=None)[0]
         assert (coefficients @ dense @ coefficients > 1e-6) == sees
     # Expectations add up.
-    expected = Expectation({SECOND: 2.0, THIRD: 3.0, DIVERGENCE: 5.0}, 0.5, 1.0, 0.0)
+    weights = {SECOND: 2.0, THIRD: 3.0, SECOND_IN_DEPTH: 2.0, THIRD_IN_DEPTH: 3.0, DIVERGENCE: 5.0}
+    expected = Expectation(weights, 0.5, 1.0, 0.0)
     whole = bound(LATTICE, 0.5) + 5.0 * stencils.divergence(LATTICE)
     stencils.add_scalar(whole, 1.0, 2.0 * stencils.smoothness(LATTICE, 2) + 3.0 * stencils.smoothness(LATTICE, 3))
     np.testing.assert_allclose(expected_inverse(LATTICE, expected), whole, rtol=1e-12)
@@ -268,6 +272,32 @@ def test_depth_gains_by_what_a_liquid_cannot_do_and_stated_errors_cover_the_trut
     assert np.all(np.sqrt(np.median(variance, axis=0)) < [3e-3, 3e-3, 8e-3])
 
 
+def beltrami(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return a smooth solenoidal field whose depth component does not change with depth."""
+    x, y, z = (2.0 * np.pi / 6.0 * points).T
+    return 0.2 * np.stack([np.sin(z) + np.cos(y), np.sin(x) + np.cos(z), np.sin(y) + np.cos(x)], axis=1)
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("seed", [31, 32])
+@pytest.mark.parametrize("flow", [vortices, beltrami])
+def test_stated_errors_cover_a_depth_component_that_noise_hides_half(flow, seed: int) -> None:
+    exact, points = tracks(flow, MANY, seed), inner(400, seed)
+    noise = np.random.default_rng(seed).normal(0.0, 0.1, MANY)
+    field = fitted(
+        replace(
+            exact,
+            value_mm=exact.value_mm + noise[:, np.newaxis] * [0.0, 0.0, 1.0],
+            covariance_mm2=exact.covariance_mm2 + np.diag([0.0, 0.0, 0.01]),
+        )
+    )
+    error, variance = field.value_at(points) - flow(points), field.variance_at(points)
+    # of 400 points some sixty are independent: 0.95 less three standard errors
+    assert np.all(np.mean(np.abs(error) < 1.96 * np.sqrt(variance), axis=0) > 0.87)
+    # and not because they are large: of 620 samples a wave's size is known to a sixth of one sample's error
+    assert np.sqrt(np.median(variance[:, 2])) < 0.04
+
+
 @pytest.mark.thorough
 def test_sources_are_not_bent_in_silence() -> None:
     samples, points = tracks(swelling, MANY, 13), inner(200, 13)
@@ -328,7 +358,7 @@ def test_walls_hold_the_field_still() -> None:
 def test_errors_that_are_stated_too_small_are_noticed() -> None:
     samples, lattice = tracks(shear, 120, 16), lattice_for(120, LOW, HIGH)
     stated = replace(samples, covariance_mm2=samples.covariance_mm2 / 4.0)
-    first = first_expectation(stated, lattice, (SECOND, THIRD, DIVERGENCE))
+    first = first_expectation(stated, lattice, (*SMOOTHNESS, DIVERGENCE))
     found, _ = most_probable(stated, lattice, first, np.random.default_rng(16))
     # twice as large; of some hundred samples a part of it is taken for what the field leaves unresolved
     assert 1.5 < found.scale < 2.2

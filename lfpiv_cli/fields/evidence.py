@@ -19,7 +19,7 @@ from scipy.linalg import cho_factor, cho_solve
 
 from lfpiv_cli.arrays import Floats
 from lfpiv_cli.fields import stencils
-from lfpiv_cli.fields.stencils import DIVERGENCE, ORDERS, Expectation, Lattice, bound, inverse_of, penalty
+from lfpiv_cli.fields.stencils import DIVERGENCE, ORDERS, SMOOTHNESS, Expectation, Lattice, bound, inverse_of, penalty
 from lfpiv_cli.fields.structure import Samples, belonging, error_covariance, without_itself
 from lfpiv_cli.threads import in_threads
 
@@ -172,6 +172,9 @@ def most_probable(
             name: weight if name == DIVERGENCE else min(weight, STRONGEST * first.weights[name])
             for name, weight in weights.items()
         }
+        for lateral, in_depth in zip(SMOOTHNESS[:2], SMOOTHNESS[2:], strict=True):
+            if in_depth in weights:
+                weights[in_depth] = min(weights[in_depth], weights[lateral])
         onward = replace(updated, weights=weights)
         if DIVERGENCE in names:
             # Not too large.
@@ -189,8 +192,11 @@ def most_probable(
 def divergence_weight(expected: Expectation, lattice: Lattice, times: float) -> float:
     """Return the weight of the divergence that counts so many times what smoothness does, for waves of two cells."""
     wave = np.pi / float(np.max(lattice.cell_mm))
-    smooth = sum(expected.weights[name] * wave ** (2 * order - 2) for name, order in ORDERS.items())
-    return float(times * smooth)
+    smooth = [
+        sum(expected.weights.get(name, 0.0) * wave ** (2 * ORDERS[name] - 2) for name in names)
+        for names in (SMOOTHNESS[:2], SMOOTHNESS[2:])
+    ]
+    return float(times * max(smooth))
 
 
 def _told(

@@ -147,9 +147,9 @@ def empty(lattice: Lattice, components: int = 3) -> Stencil:
     return np.zeros((nx, components, ny, nz, NEIGHBOURS, components, NEIGHBOURS, NEIGHBOURS))
 
 
-def add_scalar(matrix: Stencil, factor: float, integrals: Floats) -> None:
-    """Add `factor` times what is alike for all components: (nx, ny, nz, 7, 7, 7) of one of them."""
-    for component in range(matrix.shape[1]):
+def add_scalar(matrix: Stencil, factor: float, integrals: Floats, components: slice = slice(None)) -> None:
+    """Add `factor` times what is alike for some components, or all: (nx, ny, nz, 7, 7, 7) of one of them."""
+    for component in range(matrix.shape[1])[components]:
         matrix[:, component, :, :, :, component] += factor * integrals
 
 
@@ -276,10 +276,14 @@ def dense(matrix: Stencil) -> Floats:
 # The field is thought of as Gaussian, with the inverse covariance: weight times integral of squared second
 # derivatives, plus the same of third ones, plus the same of the divergence. Second derivatives alone make the
 # spectrum k^-2 of turbulence nearly (k^-5/3), third ones that of smooth flows, k^-4; the weights say how much of each
-# there is.
+# there is: of the lateral components, and of the one in depth, whose samples are known so much worse that it would be
+# smoothed by what the others show to be missing in waves that it cannot tell from noise.
 
 SECOND, THIRD, DIVERGENCE = "second", "third", "divergence"
-ORDERS = {SECOND: 2, THIRD: 3}
+SECOND_IN_DEPTH, THIRD_IN_DEPTH = "second_in_depth", "third_in_depth"
+ORDERS = {SECOND: 2, THIRD: 3, SECOND_IN_DEPTH: 2, THIRD_IN_DEPTH: 3}
+LATERAL, IN_DEPTH = slice(0, 2), slice(2, 3)
+SMOOTHNESS = (SECOND, THIRD, SECOND_IN_DEPTH, THIRD_IN_DEPTH)
 # Constants and linear fields are not penalised by derivatives; they are expected up to ten times the samples' spread.
 SPREADS = 10.0
 
@@ -307,7 +311,8 @@ def penalty(lattice: Lattice, name: str, components: int = 3) -> Stencil:
     if name == DIVERGENCE:
         return divergence(lattice)
     matrix = empty(lattice, components)
-    add_scalar(matrix, 1.0, smoothness(lattice, ORDERS[name]))
+    of = IN_DEPTH if name in (SECOND_IN_DEPTH, THIRD_IN_DEPTH) else LATERAL
+    add_scalar(matrix, 1.0, smoothness(lattice, ORDERS[name]), of)
     return matrix
 
 
