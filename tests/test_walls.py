@@ -18,8 +18,9 @@ from lfpiv_cli.particles.noise import Noise
 from lfpiv_cli.particles.view import raw_view, with_radius
 from lfpiv_cli.self_calibration.nuisances import MovableScene, Nuisances, fit_nuisances, moved_places
 from lfpiv_cli.self_calibration.refinement import Refinement
-from lfpiv_cli.self_calibration.scene_refinement import SceneRefinement, wall_by_places
+from lfpiv_cli.self_calibration.scene_refinement import SceneRefinement, together, wall_by_places
 from lfpiv_cli.self_calibration.walls import Walls, find_round_wall, find_walls
+from lfpiv_cli.verbs.refine import scene_notices
 
 WIDTH, MIDDLE, SLOPE = 8.0, -0.37, np.array([0.02, -0.013])
 SEARCHED = (-6.0, 6.0)
@@ -289,6 +290,26 @@ def test_what_is_told_and_shown_of_a_scene(scene: MovableScene, rng: np.random.G
     np.testing.assert_allclose([wall.max(), wall.min()], 5.0 + np.hypot(0.15, 0.2) * np.array([1.0, -1.0]), atol=0.05)
     np.testing.assert_array_equal(along.lines[0].get_ydata().size, len(found.position_mm))
     assert counted.get_xlim()[0] < found.wall.radius_mm < counted.get_xlim()[1]
+
+
+def test_what_contradicts_the_scene_is_told_with_both_figures(scene: MovableScene, rng: np.random.Generator) -> None:
+    """Wall and images of one place and radius are quiet; of another radius or place they are not, nor as certain."""
+    right = together(refined(scene, rng, TRUTH))
+    assert scene_notices(right) == []
+    assert right.covariance[1, 1] < 1e-6
+    sigma = right.radius_sigma_mm
+    for radius, codes in ((5.0 + 3.9 * sigma, []), (5.0 + 4.1 * sigma, ["scene-radius"])):
+        found = together(replace(refined(scene, rng, TRUTH), wall=replace(right.wall, radius_mm=radius)))
+        told = scene_notices(found)
+        assert [each.code for each in told] == codes
+    assert f"{radius:.3f} ± {sigma:.3f} mm" in told[0].text
+    assert "radius_mm is 5:" in told[0].text
+    # The images count as far as the radius is right, and the wall for the rest.
+    assert found.nuisances_sigma.scene[1] > 4.0 * sigma
+    assert found.covariance[1, 1] > 0.1 * found.by_wall_covariance[1, 1] > 10.0 * right.covariance[1, 1]
+    apart = scene_notices(together(refined(scene, rng, TRUTH + (0.0, 0.2, 0.0, 0.0))))
+    assert [each.code for each in apart] == ["scene-contradicts"]
+    assert f"and {TRUTH[1] + 0.2:z.3f} ± 0.001 mm" in apart[0].text
 
 
 @pytest.mark.parametrize("axis", [(1, 0, 0), (-1, 0.02, 0), (0, 1, 0), (0, -1, 0.03), (0.7, -0.7, 0.1)])

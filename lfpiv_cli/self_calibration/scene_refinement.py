@@ -63,6 +63,9 @@ STEPS_OF_FIRST = SEARCHES * (STEPS + 1)
 FOUND_SHARE, MOST_STEPS = 1e-5, 8
 # Wall and images agree where the chi-squared of their four differences is below that which chance exceeds in 1e-4.
 AGREEING_CHI2 = 23.5
+# The wall is not the scene's own where its radius is so many of its standard errors off. What images then say of shifts
+# is off by about as much as the radius is: behind one that is 1 % wrong, with an index 0.002 wrong, 0.058 mm in depth.
+CONTRADICTING_SIGMAS = 4.0
 # Of simulated tubes the images told the axis' place by up to 0.005 mm wrong, 0.0025 rms, with 0.001 by the noise of the
 # pixels: what the responses leave out counts as much in other images. In microlenses; tilts were as their noise says.
 NOT_NOISE_LENSES = 0.025
@@ -112,6 +115,17 @@ class SceneRefinement:
         return self.disagreement < AGREEING_CHI2
 
     @property
+    def radius_sigma_mm(self) -> float:
+        """Standard error of the wall's apparent radius; centres of particles may stay a radius off it."""
+        return float(np.hypot(self.wall.radius_sigma_mm, 0.5 * self.particle_diameter_mm))
+
+    @property
+    def radius_off_mm(self) -> float:
+        """How far the wall's apparent radius is off the scene's, where chance does not explain it; else 0."""
+        off = abs(self.wall.radius_mm - self.scene.wall.radius_mm)
+        return off if off > CONTRADICTING_SIGMAS * self.radius_sigma_mm else 0.0
+
+    @property
     def focal_point_shift_mm(self) -> float:
         """How far the focal point, from which z is counted, comes to lie further from the camera."""
         before, after = (space.lens_z_mm(self.camera) for space in (self.scene.space, self.scene.moved(self.axis)))
@@ -158,7 +172,7 @@ class SceneRefinement:
             **_told("axis_by_images", images, images_sigma),
             "disagreement_chi2": self.disagreement,
             "apparent_radius_mm": self.wall.radius_mm,
-            "apparent_radius_mm_sigma": float(np.hypot(self.wall.radius_sigma_mm, 0.5 * self.particle_diameter_mm)),
+            "apparent_radius_mm_sigma": self.radius_sigma_mm,
             **camera_figures(self.camera, self.particle_diameter_mm, self.nuisances, self.nuisances_sigma),
             "edge_blur_mm": self.wall.blur_mm,
             "stray_share": self.wall.stray_share,
@@ -260,13 +274,23 @@ def refine_scene(
         particle_diameter_mm=2.0 * view.particle_radius_mm,
         camera=camera,
     )
-    if not refinement.agree:
-        return refinement
-    # The mean of the two, weighed by what is known of them.
-    by_wall, by_images = np.linalg.inv(axis_covariance), np.diag(images_sigma.scene**-2)
+    return together(refinement)
+
+
+def together(found: SceneRefinement) -> SceneRefinement:
+    """Return the scene by wall and images, weighed by what is known of them; by the wall alone where they disagree.
+
+    A radius that is not the scene's makes what images say of shifts as uncertain as it is off.
+    """
+    sigma = found.nuisances_sigma
+    across, away = np.hypot(sigma.scene[:2], found.radius_off_mm).tolist()
+    found = replace(found, nuisances_sigma=replace(sigma, axis_across_mm=across, axis_away_mm=away))
+    if not found.agree:
+        return found
+    by_wall, by_images = np.linalg.inv(found.by_wall_covariance), np.diag(found.nuisances_sigma.scene**-2)
     covariance = np.asarray(np.linalg.inv(by_wall + by_images), dtype=np.float64)
-    together = covariance @ (by_wall @ axis + by_images @ fit.found.scene)
-    return replace(refinement, axis=together, covariance=covariance)
+    axis = covariance @ (by_wall @ found.by_wall + by_images @ found.nuisances.scene)
+    return replace(found, axis=axis, covariance=covariance)
 
 
 def wall_by_places(

@@ -123,13 +123,33 @@ def _scene(
             settings.reconstruction.particle_diameter_mm,
             advance,
         )
-    if not found.agree:
-        apart = np.abs(found.by_wall - found.nuisances.scene)[:2].max()
-        text = (
-            f"the tracers' images tell of a pipe whose axis lies {apart:.3f} mm beside that of the wall they end at, "
-            "more than chance explains; the wall is believed"
-        )
-        remedy = "check radii and refractive indices of the scene"
-        expected = f"at most {AGREEING_CHI2:g}"
-        console.warn([Notice("scene-contradicts", "scene", text, remedy, found.disagreement, expected)])
+    console.warn(scene_notices(found))
     return found
+
+
+def scene_notices(found: SceneRefinement) -> list[Notice]:
+    """Return where images, the wall that tracers end at, and the scene as it was given contradict each other."""
+    notices, remedy = [], "measure radii and refractive indices of the scene"
+    if not found.agree:
+        images, wall = (
+            " and ".join(f"{value:z.3f} ± {error:.3f}" for value, error in zip(axis[:2], sigma[:2], strict=True))
+            for axis, sigma in (
+                (found.nuisances.scene, found.nuisances_sigma.scene),
+                (found.by_wall, np.sqrt(np.diag(found.by_wall_covariance))),
+            )
+        )
+        text = (
+            f"the tracers' images tell of a pipe whose axis lies {images} mm (across, away) from where it is said to, "
+            f"the wall that they end at of one at {wall} mm, more apart than chance explains; the wall is believed"
+        )
+        expected = f"at most {AGREEING_CHI2:g}"
+        notices.append(Notice("scene-contradicts", "scene", text, remedy, found.disagreement, expected))
+    if found.radius_off_mm:
+        radius, told = found.wall.radius_mm, found.scene.wall.radius_mm
+        text = (
+            f"tracers end {radius:.3f} ± {found.radius_sigma_mm:.3f} mm from the pipe's axis, and its radius_mm is "
+            f"{told:g}: what images say of the axis is taken to be {found.radius_off_mm:.3f} mm uncertain, and the "
+            "flow behind such a scene is wrong"
+        )
+        notices.append(Notice("scene-radius", "scene", text, f"{remedy}, and refine again", radius, f"{told:g} mm"))
+    return notices
