@@ -2,7 +2,7 @@
 
 Everything goes into `docs/_generated`, which is not kept: the sample's chain with its pictures and what it prints, a
 page for each command, the Python interface, the tree of the package, the drawings of the light's way and of a pipe's
-board, and a tracer's light by rays and waves.
+board, a tracer's light by rays and waves, and the figures.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from typing import Any
 
 import click_commands
 import drawing
+import figures
 import light_figure
 
 import lfpiv_cli
@@ -72,7 +73,7 @@ def everything() -> None:
 
 
 def run_sample() -> None:
-    """Run the sample's chain, unless it was run with the same code and the same data."""
+    """Run the sample's chain and draw the figures, unless that was done with the same code and the same data."""
     stamp = SAMPLE / "made_from"
     made_from = fingerprint()
     if stamp.exists() and stamp.read_text() == made_from:
@@ -90,13 +91,14 @@ def run_sample() -> None:
         if done.returncode:
             raise RuntimeError(f"lfpiv {arguments}: exit code {done.returncode}: {done.stdout}")
         (SAMPLE / f"{name}.txt").write_text(f"$ lfpiv {arguments}\n{done.stdout}", encoding="utf-8")
+    figures.write_all(GENERATED / "figures", SAMPLE)
     stamp.write_text(made_from)
 
 
 def fingerprint() -> str:
-    """Return a hash of the package, the sample and the chain."""
+    """Return a hash of the package, the figures, the sample and the chain."""
     digest = hashlib.sha256(repr(CHAIN).encode())
-    for path in [*sorted(PACKAGE.rglob("*.py")), *INPUTS.values()]:
+    for path in [*sorted(PACKAGE.rglob("*.py")), DOCS / "figures.py", *INPUTS.values()]:
         digest.update(path.read_bytes())
     return digest.hexdigest()
 

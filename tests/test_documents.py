@@ -136,7 +136,9 @@ def test_architecture_and_glossary_name_parts_of_the_package() -> None:
 def test_equations_name_what_computes_and_what_holds_them() -> None:
     text = (ROOT / "docs" / "equations.md").read_text(encoding="utf-8")
     paper = text.split("## The paper's", 1)[1].split("\n## ", 1)[0]
-    numbers = {int(number) for row in re.findall(r"^\| ([\d, ]+) \|", paper, re.MULTILINE) for number in row.split(", ")}
+    numbers = {
+        int(number) for row in re.findall(r"^\| ([\d, ]+) \|", paper, re.MULTILINE) for number in row.split(", ")
+    }
     assert numbers == set(range(1, 22))
     rows = [line.split(" | ")[-2:] for line in text.splitlines() if line.startswith("| ") and "`" in line]
     for computed, held in rows:
