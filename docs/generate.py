@@ -2,7 +2,7 @@
 
 Everything goes into `docs/_generated`, which is not kept: the sample's chain with its pictures and what it prints, a
 page for each command, the Python interface, the tree of the package, the drawings of the light's way and of a pipe's
-board, a tracer's light by rays and waves, and the figures.
+board, a tracer's light by rays and waves, statistics of a turbulent channel, and the figures.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ import click_commands
 import drawing
 import figures
 import light_figure
+import statistics_figure
 
 import lfpiv_cli
 
@@ -66,6 +67,7 @@ def everything() -> None:
     (GENERATED / "light.svg").write_text(drawing.light(), encoding="utf-8")
     (GENERATED / "pipe_board.svg").write_text(drawing.board_of_a_pipe(), encoding="utf-8")
     light_figure.write_figure(ROOT / "configs" / "table2.yaml", GENERATED / "light_by_waves.png")
+    statistics_figure.write_figure(INPUTS["rig.yaml"], GENERATED / "statistics.png")
     (GENERATED / "tree.md").write_text("\n".join(tree()) + "\n", encoding="utf-8")
     (GENERATED / "interface.md").write_text("\n".join(interface()) + "\n", encoding="utf-8")
     write_command_pages()

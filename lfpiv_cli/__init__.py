@@ -26,6 +26,7 @@ into the functions above. Volumes and fields are indexed [z, y, x]; points and v
 
 Each command is a function as well, files in and files out, with its options as a dataclass::
 
+    from lfpiv_cli.verbs.moments import statistics as statistics
     from lfpiv_cli.verbs.reconstruct import ReconstructOptions, reconstruct_files
 
     reconstruct_files(Path("weights.h5"), images, Path("volumes"), ReconstructOptions(dark=Path("dark.tif")))
@@ -59,6 +60,7 @@ if TYPE_CHECKING:
     from lfpiv_cli.verbs.correlate import correlate as correlate
     from lfpiv_cli.verbs.fields import fit_field as fit_field
     from lfpiv_cli.verbs.following import follow as follow
+    from lfpiv_cli.verbs.moments import statistics as statistics
     from lfpiv_cli.verbs.particles import find_particles as find_particles
     from lfpiv_cli.verbs.reconstruct import reconstruct as reconstruct
     from lfpiv_cli.verbs.tracks import track as track
@@ -86,6 +88,7 @@ MODULES = {
     "open_weights": "files.weights_file",
     "read_image": "files.images",
     "reconstruct": "verbs.reconstruct",
+    "statistics": "verbs.moments",
     "track": "verbs.tracks",
 }
 __all__ = ["__version__", *MODULES]

@@ -31,7 +31,9 @@ RIGS = {"rig", "rig by init"}
 IMAGES = {"white image", "dark image", "board image", "frame", "residual image"}
 CALIBRATIONS = {"calibration", "fitted rays", "refined calibration"}
 WEIGHTS = {"weights", "weights without calibration", "weights on demand", "counted weights", "weights in strips"}
-VECTORS = {"vectors", "mean vectors", "tracks on a grid", "combined vectors", "field", "field with pressure"}
+VECTORS = {
+    *("vectors", "mean vectors", "statistics", "tracks on a grid", "combined vectors", "field", "field with pressure"),
+}
 PARTICLES = {"particles", "followed particles"}
 SEQUENCES = {"tracks of a sequence", "followed tracks"}
 TRACKS = {"tracks", *SEQUENCES}
@@ -127,6 +129,7 @@ PLACES = {
     "correlate --mask": Place("correlate {first volume} {volume} --mask {} -o {out}/v.vtkhdf", {"volume"}),
     "combine VECTORS_A": Place("combine {} {vectors} -o {out}/v.vtkhdf", VECTORS),
     "combine VECTORS_B": Place("combine {vectors} {} -o {out}/v.vtkhdf", VECTORS),
+    "statistics SAMPLES": Place("statistics {} -o {out}/s.vtkhdf", VECTORS | TRACKS),
     "track PARTICLES": Place("track {first particles} {} --grid -o {out}/t.vtkhdf", PARTICLES),
     "field SAMPLES": Place("field {} -o {out}/f.vtkhdf", VECTORS | TRACKS),
     "field --at": Place("field {tracks} --at {} -o {out}/f.vtkhdf", {"points"}),

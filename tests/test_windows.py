@@ -8,11 +8,11 @@ import pytest
 from numpy.typing import NDArray
 
 from benchmarks.volumes import Seeding, volume_pair
-from lfpiv_cli.errors import ConfigError, InputError
+from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.files.config import load_rig
 from lfpiv_cli.flow.correlation import Coarse, correlate, plan
 from lfpiv_cli.flow.deformation import MOST_TAPS, NEIGHBOURS, gather_taps, interpolate
-from lfpiv_cli.flow.field import MASKED, REJECTED, REPLACED, SECOND_PEAK, VALID, VectorField, statistics_of
+from lfpiv_cli.flow.field import MASKED, REJECTED, REPLACED, SECOND_PEAK, VALID, VectorField
 from lfpiv_cli.flow.moments import MOMENTS, gauss_newton, pair_moments
 from lfpiv_cli.flow.outliers import EXPECTED_NOISE_VOXEL, expected_noise, fill_field, predict, validate_vectors
 from lfpiv_cli.flow.sums import map_sums, margins
@@ -341,43 +341,3 @@ def test_prediction_is_the_median_of_neighbours_carried_by_median_slopes(rng: np
         np.testing.assert_allclose(told[0][number], middle, atol=1e-12)
         np.testing.assert_allclose(told[1][number], np.median(np.abs(carried - middle), axis=0), atol=1e-12)
         assert told[2][number] == pytest.approx(len(carried) / seen.sum())
-
-
-SHAPE = (2, 3, 4)
-
-
-def fields(rng: np.random.Generator, count: int) -> list[VectorField]:
-    ones, flag = np.ones(SHAPE), np.zeros(SHAPE, dtype=np.uint8)
-    made = []
-    for _ in range(count):
-        # A large mean, in which sums of squares would lose the fluctuations.
-        moved = 1e6 + rng.standard_normal((*SHAPE, 3))
-        grid = Grid(SHAPE[::-1], (0.8,) * 3, (0.0,) * 3)
-        made.append(VectorField(grid, moved, moved, ones, ones, ones, flag, None, (0.1,) * 3, 1e-3, (8, 8, 8)))
-    return made
-
-
-def test_mean_and_fluctuations_are_those_of_the_stack_without_what_is_rejected(rng: np.random.Generator) -> None:
-    batch = fields(rng, 5)
-    stack = np.stack([field.displacement_voxel for field in batch])
-    found = statistics_of(iter(batch))
-    np.testing.assert_allclose(found.mean.displacement_voxel, stack.mean(axis=0), rtol=1e-12)
-    np.testing.assert_allclose(found.rms_voxel, stack.std(axis=0), rtol=1e-8)
-    np.testing.assert_allclose(found.mean.uncertainty_voxel, stack.std(axis=0, ddof=1) / np.sqrt(5.0), rtol=1e-8)
-    assert np.all(found.samples == 5)
-    one, other = fields(rng, 2)
-    for batch in ([], [one, replace(other, dt_s=2e-3)]):
-        with pytest.raises(InputError):
-            statistics_of(batch)
-    batch = fields(rng, 3)
-    flag = np.zeros(SHAPE, dtype=np.uint8)
-    flag[0, 0, 0] = REJECTED
-    spoilt = np.where(flag[..., np.newaxis] == REJECTED, np.nan, batch[0].displacement_voxel)
-    batch[0] = replace(batch[0], flag=flag, displacement_voxel=spoilt)
-    nothing = [replace(field, flag=np.where(np.indices(SHAPE)[2] == 3, REJECTED, field.flag)) for field in batch]
-    found = statistics_of(nothing)
-    expected = np.mean([field.displacement_voxel[0, 0, 0] for field in batch[1:]], axis=0)
-    np.testing.assert_allclose(found.mean.displacement_voxel[0, 0, 0], expected, rtol=1e-12)
-    assert found.samples[0, 0, 0] == 2
-    assert np.all(found.mean.flag[..., 3] == REJECTED)
-    assert np.all(np.isnan(found.mean.velocity[..., 3, :]))

@@ -75,6 +75,7 @@ STEPS = {
     "vectors": "correlate {first volume} {volume} --derived -o {}/vectors.vtkhdf",
     "mean": "correlate {volumes/frame_0000.vtkhdf} {volumes/frame_0001.vtkhdf} {volumes/frame_0002.vtkhdf} "
     "--pairing sequence --derived --mean {}/mean.vtkhdf -o {}/vectors",
+    "statistics": "statistics {mean/vectors} -o {}/statistics.vtkhdf",
     "tracks": "track {first particles} {particles} --grid -o {}/tracks.vtkhdf",
     "sequence": f"track {FOUND} -o {{}}/sequence.vtkhdf",
     "combined": "combine {vectors} {tracks on a grid} -o {}/combined.vtkhdf",
@@ -116,6 +117,7 @@ KINDS = {
     "volume": "volumes/frame_0001.vtkhdf",
     "vectors": "vectors/vectors.vtkhdf",
     "mean vectors": "mean/mean.vtkhdf",
+    "statistics": "statistics/statistics.vtkhdf",
     "tracks on a grid": "tracks/tracks_grid.vtkhdf",
     "combined vectors": "combined/combined.vtkhdf",
     "field": "field/field.vtkhdf",

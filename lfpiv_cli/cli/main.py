@@ -169,6 +169,7 @@ COMMANDS = (
     measuring.reconstruct,
     measuring.correlate,
     measuring.combine,
+    measuring.statistics,
     measuring.track,
     measuring.field,
     measuring.follow,

@@ -29,6 +29,7 @@ from lfpiv_cli.cli.options import (
     pairing_options,
     parsed_by,
     raw_option,
+    resume_option,
     watch_options,
     white_option,
     work_options,
@@ -170,6 +171,17 @@ def follow() -> None:
     """
 
 
+def parse_sides(text: str) -> tuple[float, float, float]:
+    """Return the sides of bins in mm, given as 1 or 1x1x2."""
+    try:
+        sides = [float(each) for each in text.lower().split("x")]
+    except ValueError:
+        sides = []
+    if len(sides) not in (1, 3) or not all(0.0 < side < float("inf") for side in sides):
+        raise UsageError(f"--bin-mm: {text!r} is neither a length in mm nor three of them, as 1x1x2")
+    return (sides[0], sides[len(sides) // 2], sides[-1])
+
+
 def parse_windows(text: str) -> tuple[int | tuple[int, ...], ...]:
     """Return windows given as 32,16 or 32x32x16,16x16x8."""
     windows: list[int | tuple[int, ...]] = []
@@ -238,6 +250,42 @@ def combine() -> None:
 
     \b
     Example: lfpiv combine vectors.vtkhdf tracks_grid.vtkhdf -o combined.vtkhdf
+    """
+
+
+@command("statistics")
+@inputs_argument("samples", "results")
+@click.option(
+    "--bin-mm",
+    callback=parsed_by(parse_sides),
+    show_default="the final windows'",
+    help="Of tracks: sides of the bins that they are sorted into, as 1 or 1x1x2.",
+)
+@click.option(
+    "--fewest", type=click.IntRange(min=5), show_default="20", help="Of tracks: bins with fewer have no statistics."
+)
+@click.option(
+    "--profile",
+    show_default="z",
+    help="Along an axis (z), a line (z@x=0,y=1.5), or by the distance from an axis (r@x).",
+)
+@resume_option
+@output_option("File of statistics to write (.vtkhdf).")
+@common_options
+@calls("statistics.statistics_of_files", "StatisticsOptions", "samples", "output")
+def statistics() -> None:
+    """Mean, rms, Reynolds stresses, skewness and kinetic energy of a flow over many pairs, with standard errors.
+
+    Vectors count at the nodes of their grid, tracks where they are, in bins (ensemble PTV), in which a linear trend is
+    no fluctuation. The measurement's stated noise is taken out of the stresses; they are there with it, too. Errors are
+    by block bootstrap over the pairs, in the order of their names: how long the flow remembers is estimated from them.
+
+    `lfpiv report` makes a page of the file, `lfpiv plot` its pictures.
+
+    \b
+    Example: lfpiv statistics vectors -o statistics.vtkhdf
+             lfpiv statistics tracks --bin-mm 1x1x2 --profile z@x=0,y=0 -o statistics.vtkhdf
+             lfpiv statistics run/tracks.vtkhdf --profile r@x -o statistics.vtkhdf
     """
 
 

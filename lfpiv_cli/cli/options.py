@@ -296,7 +296,7 @@ def output_option(text: str, required: bool = True) -> Callable[..., Any]:
 
 
 # Of the paths that a command is given, those that it writes.
-OUTPUTS = ("output", "picture", "failures", "cache")
+OUTPUTS = ("output", "picture", "failures", "cache", "mean")
 
 
 def _flat(values: Iterable[Any]) -> list[Any]:

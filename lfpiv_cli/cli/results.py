@@ -120,7 +120,7 @@ def validate(
 @common_options
 @calls("report.report", "ReportOptions", "folder", "output")
 def report() -> None:
-    """Make one page of a folder of results: verdict, pictures, figures, settings and warnings.
+    """Make one page of a folder of results, or of one of its files: verdict, pictures, figures, settings and warnings.
 
     It needs no truth, holds all its pictures and loads nothing, so that it can be handed on as it is; tracks can be
     turned in it, and it prints. The verdict is of calibration, images and vectors: good, look (at the reasons) or no.

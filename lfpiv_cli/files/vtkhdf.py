@@ -202,6 +202,8 @@ def write_vectors(
     provenance: Mapping[str, Any],
     overwrite: bool,
     extra: Mapping[str, tuple[NDArray[Any], str]] | None = None,
+    attributes: Mapping[str, Any] | None = None,
+    tables: Mapping[str, Mapping[str, tuple[NDArray[Any], str]]] | None = None,
 ) -> None:
     """Write a vector field: `velocity` (m/s), the displacements (voxel) and what is known of their quality.
 
@@ -209,9 +211,11 @@ def write_vectors(
     ----------
     reference : the origin that the grid's z counts from
     extra : arrays (nz, ny, nx) or (nz, ny, nx, 3) to store besides, by their name, with their unit
+    attributes : scalars, strings and short arrays for the root
+    tables : arrays of other shapes, by the name of their group and their own, with their unit
     """
     with created(path, overwrite=overwrite, check=open_vectors) as file:
-        write_root(file, VECTORS_FORMAT, FORMAT_VERSION, reference, {}, provenance)
+        write_root(file, VECTORS_FORMAT, FORMAT_VERSION, reference, attributes or {}, provenance)
         file.attrs["voxel_mm"] = np.asarray(field.voxel_mm, dtype=np.float64)
         file.attrs["window_voxel"] = np.asarray(field.window_voxel, dtype=np.int64)
         file.attrs["flag_meanings"] = np.bytes_(FLAG_MEANINGS)
@@ -222,6 +226,10 @@ def write_vectors(
         if field.uncertainty_voxel is not None:
             arrays[UNCERTAINTY] = (field.uncertainty_voxel, "voxel")
         _write_on_grid(file, field.grid, arrays | dict(extra or {}))
+        for table, columns in (tables or {}).items():
+            group = file.create_group(table)
+            for name, (array, unit) in columns.items():
+                write_array(group, name, array, unit)
 
 
 def open_vectors(path: Path | str) -> VectorField:
@@ -253,6 +261,20 @@ def open_vectors(path: Path | str) -> VectorField:
     if not np.isfinite(field.displacement_voxel[field.flag < REJECTED]).all():
         raise InputError(f"{path}: a vector that counts as valid is not a finite number")
     return field
+
+
+def read_extra(path: Path) -> tuple[dict[str, NDArray[Any]], dict[str, dict[str, NDArray[Any]]]]:
+    """Read all arrays of vectors on the grid, three axes and components, and those of other shapes by their groups."""
+    with open_h5(path, VECTORS_FORMAT, FORMAT_VERSION) as file:
+        size, grid = path.stat().st_size, grid_in(file)
+        places = 2 if grid.shape_zyx[0] == 1 else 3
+        names = list(member(member(file, "VTKHDF"), "PointData"))
+        arrays = read_on_grid(path, file, grid, {name: array_member(file, name).ndim > places for name in names})
+        groups = [name for name in file if name != "VTKHDF" and isinstance(member(file, name), h5py.Group)]
+        tables = {
+            name: {each: read_array(array_member(file[name], each), size) for each in file[name]} for name in groups
+        }
+    return arrays, tables
 
 
 def read_grid(path: Path) -> Grid:

@@ -34,9 +34,10 @@ from lfpiv_cli.grid import FOCAL_POINT, Grid
 from lfpiv_cli.notice import warn_of
 from lfpiv_cli.verbs import checks
 from lfpiv_cli.verbs.batches import ALL, BatchOptions, Expected, Failure, Worked, dry_run, work_through
-from lfpiv_cli.verbs.fields import Mean, are_measured, arrays_of, mean_of_measured
+from lfpiv_cli.verbs.fields import arrays_of
 from lfpiv_cli.verbs.frames import dt_notices
 from lfpiv_cli.verbs.pairs import PairBatch, PairBatchOptions, coming_pairs, watched, work_as_they_come
+from lfpiv_cli.verbs.statistics import Mean, are_measured, mean_of_measured
 
 
 def correlate(

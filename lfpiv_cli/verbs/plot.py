@@ -23,9 +23,11 @@ from lfpiv_cli.files.inputs import given
 from lfpiv_cli.files.pages import ensure_drawing, write_pdf, write_picture
 from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, TRACKS_FORMAT, TRAJECTORIES_FORMAT, Points, read_points
 from lfpiv_cli.files.weights_file import FORMAT, WeightsFile, open_weights
+from lfpiv_cli.flow.field import VectorField
 from lfpiv_cli.notice import written
 from lfpiv_cli.pictures import calibration as of_calibration
 from lfpiv_cli.pictures import points as of_points
+from lfpiv_cli.pictures import statistics as of_statistics
 from lfpiv_cli.pictures import vectors as of_vectors
 from lfpiv_cli.pictures.style import caption_of
 from lfpiv_cli.verbs.frames import residual_path
@@ -80,6 +82,25 @@ def _of_vectors(path: Path) -> Figures:
     figures["displacements"] = partial(of_vectors.displacements_figure, field, _lens_mm(path))
     if field.dt_s is not None:
         figures["gradients"] = partial(of_vectors.gradients_figure, field)
+    return figures | _of_statistics(path, field)
+
+
+def _of_statistics(path: Path, field: VectorField) -> Figures:
+    """Return the figures of statistics over many pairs, where vectors are their mean."""
+    arrays, tables = vtkhdf.read_extra(path)
+    if "convergence" not in tables:
+        return {}
+    figures: Figures = {
+        "moments": partial(of_statistics.moments_figure, field.grid, field.velocity, arrays),
+        "stresses": partial(of_statistics.stresses_figure, field.grid, arrays),
+    }
+    if "profile" in tables:
+        said = vtkhdf.read_header(path).attributes
+        names = said["profile_components"].split(", ")
+        figures["profile"] = partial(of_statistics.profile_figure, said["profile"], names, tables["profile"])
+    pairs, *spreads = (tables["convergence"][name] for name in ("pairs", "velocity_spread", "reynolds_stress_spread"))
+    if all((spread > 0.0).any() for spread in spreads):  # one pair tells none
+        figures["convergence"] = partial(of_statistics.convergence_figure, pairs, *spreads)
     return figures
 
 

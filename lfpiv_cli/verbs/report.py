@@ -41,13 +41,15 @@ from lfpiv_cli.files.particle_file import (
     read_points,
 )
 from lfpiv_cli.files.provenance import sha256
-from lfpiv_cli.files.vtkhdf import VECTORS_FORMAT, VOLUME_FORMAT, open_vectors, read_header
-from lfpiv_cli.flow.field import MASKED, REJECTED, VALID, VectorField, statistics_of
+from lfpiv_cli.files.vtkhdf import VECTORS_FORMAT, VOLUME_FORMAT, open_vectors, read_extra, read_header
+from lfpiv_cli.flow.field import MASKED, REJECTED, VALID, VectorField
+from lfpiv_cli.flow.statistics import PAIRS
 from lfpiv_cli.notice import written
 from lfpiv_cli.pictures.points import MOST_LINES, has_views, lines_view, trajectory_lines
 from lfpiv_cli.pictures.style import caption_of
-from lfpiv_cli.pictures.vectors import planes_figure, profiles_figure, series_figure, sigma_figure
+from lfpiv_cli.pictures.vectors import planes_figure, profiles_figure, series_figure, sigma_figure, speed_unit
 from lfpiv_cli.verbs import checks
+from lfpiv_cli.verbs.moments import of_fields
 from lfpiv_cli.verbs.plot import figures_of
 
 if TYPE_CHECKING:
@@ -72,10 +74,11 @@ LONGEST_TABLE, LONGEST_OTHER = 60, 20
 MOST_FIELDS, MOST_REASONS = 1000, 3
 # Commands, by their records, whose vectors are made of others that stand beside them.
 MEAN = "correlate mean"
-MADE_OF_OTHERS = (MEAN, "combine")
+MADE_OF_OTHERS = (MEAN, "statistics", "combine")
 # What is drawn of the vectors that the verdict is of, of others, and of other files: a page of paper holds three.
 OF_VECTORS, OF_OTHERS = ("planes", "profiles", "sigma"), ("planes",)
 OF_PARTICLES, OF_VOLUMES = ("image", "residual", "depths"), ("projections",)
+OF_STATISTICS = ("moments", "stresses", "profile", "convergence")
 OF_TRACKS, OF_WEIGHTS = ("space", "sigma"), ("light",)
 # A cell of a figure that is not known.
 UNKNOWN = "–"
@@ -132,7 +135,7 @@ def report(
     overwrite: bool = False,
     console: Console = CONSOLE,
 ) -> dict[str, Any]:
-    """Write a page of what a folder of results holds: verdict, pictures, figures, settings and warnings."""
+    """Write a page of a folder of results, or a file of one: verdict, pictures, figures, settings and warnings."""
     if output.suffix != ".html":
         raise UsageError(f"{output}: a report is a page, its name ends in .html")
     ensure_writable(output, overwrite, options.raw)
@@ -140,7 +143,7 @@ def report(
         count_pages(path)  # for its checks
     ensure_pages()
     ensure_drawing()
-    contents = contents_of(folder)
+    contents = contents_of(folder.parent, [folder]) if folder.is_file() else contents_of(folder)
     fields = {path: open_vectors(path) for path in contents.of("vectors")[:MOST_FIELDS]}
     parts = judged(contents, fields)
     words = {part: checks.worst(lines, "good") for part, lines in parts.items()}
@@ -302,7 +305,7 @@ class Drawer:
         mean, sigma = (np.array(each) for each in zip(*map(checks.velocity_of, fields.values()), strict=True))
         found = [self._drawn(caption_of(series_figure), series_figure(list(fields), mean, sigma))]
         try:
-            whole = statistics_of(fields.values()).mean
+            whole = of_fields(fields.values()).mean
         except InputError:  # they have no mean
             return found
         for draw in (planes_figure, profiles_figure, sigma_figure):
@@ -375,6 +378,9 @@ def _chain(contents: Contents, fields: Fields, drawer: Drawer) -> Iterable[Secti
             else:
                 pictures += drawer.pictures(group[0], only=OF_OTHERS if number else OF_VECTORS)
         yield Section("Vectors", "vectors", text, tables=(table,), pictures=tuple(pictures))
+    for path in [path for path in fields if "pairs" in read_header(path).attributes][:1]:
+        pictures = drawer.pictures(path, only=OF_STATISTICS)
+        yield Section("Statistics", "statistics", tables=tuple(_statistics(path)), pictures=tuple(pictures))
     for path in contents.of("tracks")[:1]:
         points = open_tracks(path)
         view = _view(points) if has_views() and len(points.position_mm) else ""
@@ -418,6 +424,32 @@ def _sigma(field: VectorField) -> float:
     """Return the size of the usual stated error of vectors, mm; infinite where none is stated."""
     sigma = checks.quality_of(field).summary()["uncertainty_voxel_median"]
     return float("inf") if sigma is None else float(np.linalg.norm(np.multiply(sigma, field.voxel_mm)))
+
+
+def _statistics(path: Path) -> Iterable[Table]:
+    """Yield what statistics are made of, and their profile."""
+    said, (_, tables) = read_header(path).attributes, read_extra(path)
+    about = {
+        "pairs": said["pairs"],
+        "integral time of u, v, w (pairs)": said["integral_time_pairs"],
+        "independent pairs": 0.5 * said["pairs"] / max(said["integral_time_pairs"]),
+        "block of the bootstrap (pairs)": said["block_pairs"],
+    }
+    yield Table(path.name, ("figure", "value"), tuple((name, _cell(value)) for name, value in about.items()))
+    if "profile" not in tables:
+        return
+    line, names = tables["profile"], said["profile_components"].split(", ")
+    factor, unit = speed_unit(line["velocity_rms"])
+    heads = [f"{name} ({unit})" for name in names] + [f"<{names[i]}' {names[j]}'> ({unit})²" for i, j in PAIRS]
+    value, sigma = (
+        np.hstack([factor * line[f"velocity{end}"], factor**2 * line[f"reynolds_stress{end}"]])
+        for end in ("", "_sigma")
+    )
+    rows = (
+        (written(at), *(f"{written(x)} ± {written(error, 2)}" for x, error in zip(*each, strict=True)), str(samples))
+        for at, *each, samples in zip(line["at_mm"], value, sigma, line["samples"], strict=True)
+    )
+    yield Table("Profile, without noise", (f"{said['profile']} (mm)", *heads, "samples"), tuple(rows))
 
 
 Row = dict[str, str]

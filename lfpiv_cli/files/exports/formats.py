@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from lfpiv_cli.errors import InputError, OutputError, UsageError
 from lfpiv_cli.files.exports import vtk
-from lfpiv_cli.files.hdf5 import array_member, format_of, member, open_h5
+from lfpiv_cli.files.hdf5 import format_of, open_h5
 from lfpiv_cli.files.particle_file import (
     PARTICLES_FORMAT,
     POSITION,
@@ -28,7 +28,7 @@ from lfpiv_cli.files.vtkhdf import (
     grid_in,
     open_vectors,
     open_volume,
-    read_on_grid,
+    read_extra,
     read_root,
 )
 from lfpiv_cli.flow.field import REJECTED
@@ -100,13 +100,12 @@ def read_content(path: Path) -> Content:
         )
     if name == VECTORS_FORMAT:
         open_vectors(path)  # for its checks
+        found, _ = read_extra(path)
+        # All arrays, those that commands store besides, too; the velocity first, as it is what is asked for.
+        arrays = dict(sorted(found.items(), key=lambda each: (each[0] != "velocity", each[0])))
         with open_h5(path) as file:
             grid, root = grid_in(file), read_root(file)
-            # All arrays, those that commands store besides, too; the velocity first, as it is what is asked for.
-            names = sorted(member(member(file, "VTKHDF"), "PointData"), key=lambda each: (each != "velocity", each))
-            places = 2 if grid.shape_zyx[0] == 1 else 3
-            arrays = read_on_grid(path, file, grid, {each: array_member(file, each).ndim > places for each in names})
-            units = {each: file[each].attrs["units"].decode() for each in names}
+            units = {each: file[each].attrs["units"].decode() for each in arrays}
         return Content(name, grid, arrays, units, root.attributes, root.provenance)
     points = read_points(path, name)
     arrays = {POSITION: points.position_mm, **points.arrays}
