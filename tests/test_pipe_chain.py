@@ -10,7 +10,7 @@ import pytest
 import tifffile
 from scipy.spatial import KDTree
 
-from lfpiv_cli.errors import ConfigError
+from lfpiv_cli.errors import ConfigError, InputError
 from lfpiv_cli.files.calibration_file import open_calibration, write_calibration
 from lfpiv_cli.files.config import load_rig
 from lfpiv_cli.files.hdf5 import open_h5, read_provenance
@@ -19,6 +19,7 @@ from lfpiv_cli.files.particles import read_particles
 from lfpiv_cli.files.vtkhdf import open_vectors
 from lfpiv_cli.files.weights_file import open_weights
 from lfpiv_cli.flow.field import MASKED
+from lfpiv_cli.self_calibration import refinement
 from lfpiv_cli.weights.strips import StripOperator
 from tests.commands import run
 
@@ -260,6 +261,46 @@ SCENES = {
     "tilted": (TILTED.format(z=-8), TILTED.format(z=-5), "1.0, 0.4, 2.7"),
     "bowl": (BOWL.format(radius=15), BOWL.format(radius=13), "0, 0, 2.7"),
 }
+PLANES = "kind: plane, z_mm: -2.8", "kind: plane, z_mm: -2.0"
+
+
+def tube(radius_mm: float) -> tuple[str, str]:
+    """The faces of a tube with 0.8 mm of wall."""
+    face = "kind: cylinder, axis: x, radius_mm: {}, centre_mm: [0, 0, 0]"
+    return face.format(radius_mm + 0.8), face.format(radius_mm)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("shown", "told", "words"),
+    [
+        (PLANES, tube(2.0), r"of the image's light is not that of the \d+ tracers .* at most 45%"),
+        (tube(2.0), tube(2.6), r"98% of the tracers lie within [12]\.\d+ mm .* radius_mm is 2\.6"),
+        (tube(2.0), tube(2.0), "searched on"),
+    ],
+)
+def test_images_that_are_not_of_the_pipe_are_refused_before_the_search(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, shown: tuple[str, str], told: tuple[str, str], words: str
+) -> None:
+    """What fits is searched on; steps of the scene are not tried on what does not."""
+
+    def on(*_: object) -> None:
+        raise InputError("searched on")
+
+    monkeypatch.setattr(refinement, "fit_nuisances", on)
+    for name, (outer, inner) in (("shown", shown), ("told", told)):
+        text = RIG.format(outer=outer, inner=inner, centre="0, 0, 0", seed=31).replace("[14, 12, 30]", "[24, 20, 40]")
+        pipe = f"pipe: {{{inner.split(', ')[2]}}}\n" if "cylinder" in inner else ""
+        (tmp_path / f"{name}.yaml").write_text(text.replace("particles: 24", "particles: 250\n  rays: 8000") + pipe)
+    run("simulate", "particles", tmp_path / "shown.yaml", "-o", tmp_path / "sim")
+    run("simulate", "white", tmp_path / "told.yaml", "-o", tmp_path)
+    stills = ("--white", tmp_path / "white.tif", "--dark", tmp_path / "dark.tif")
+    run("calibrate-snapshot", tmp_path / "told.yaml", *stills, "-o", tmp_path / "lattice.h5")
+    words_of = ("--calibration", tmp_path / "lattice.h5", "--dark", tmp_path / "dark.tif")
+    with pytest.raises(InputError, match=words):
+        run("refine-calibration", tmp_path / "told.yaml", tmp_path / "sim" / "pair_a.tif", *words_of)
+
+
 # Of one particle in x, y and z, several of their errors.
 NEAR_MM = np.array([0.03, 0.03, 0.15])
 
