@@ -181,6 +181,18 @@ def test_few_and_crowded_tracers_are_counted(bench: Bench, number: float) -> Non
     assert np.mean(counts) == pytest.approx(number, rel=0.2)
 
 
+@pytest.mark.parametrize("depth", [0.1, 1.6, 2.4])
+def test_a_single_faint_tracer_is_no_crowd(bench: Bench, depth: float) -> None:
+    # The dark pixels' own noise, as light that all microlenses share, made it 10 to 40 for each of them.
+    image, content = np.random.default_rng(0).normal(0.0, 6.0, bench.content.image_shape), bench.content
+    tracer = np.array([[0.05, -0.03, depth, 1e4]])
+    add_all(raw_view(content.camera, bench.settings.media_model(), 0.025), tracer, 1.0, image.ravel(), (0.0, 2.5))
+    image = image.astype(np.float32)
+    counted = tracers_per_lens(bench, frame_of(bench, image, image))
+    assert counted is not None
+    assert counted < 0.2
+
+
 @pytest.mark.thorough
 def test_tracers_are_counted_few_or_crowded_and_light_that_does_not_tell_is_not(bench: Bench) -> None:
     image = image_of(bench, 0.5, 0)

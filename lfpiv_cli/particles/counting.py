@@ -16,10 +16,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
+from scipy.special import ndtri
 
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.camera import Camera, Lattice
 from lfpiv_cli.particles.fitting import add_all
+from lfpiv_cli.particles.noise import read_noise
 from lfpiv_cli.particles.search import Task
 from lfpiv_cli.particles.view import View
 
@@ -33,8 +35,10 @@ FIELD_LENSES = 24
 LEAST_PIXELS = 0.9
 # So many microlenses tell the variance to a third; of the known tracers as many images are made as show so many.
 FEWEST_LENSES, LENSES_OF_KNOWN = 50, 4000
-# Darker pixels than this percentile lie between lens images, and show what is left of a background.
+# Darker pixels than this percentile lie between lens images, and show what is left of a background: by so many
+# standard deviations of the read noise too little, which beside a faint tracer would be light that all share.
 BACKGROUND_PERCENTILE = 1.0
+BELOW_SIGMAS = float(-ndtri(0.01 * BACKGROUND_PERCENTILE))
 # The nearest microlenses of so many rows are sought at once: of all, it would take gigabytes.
 ROWS_AT_ONCE = 64
 
@@ -112,7 +116,8 @@ def tracers_in_image(
     seen = int(np.count_nonzero(counted))
     if seen < FEWEST_LENSES:
         return None
-    background = np.percentile(counts[usable], BACKGROUND_PERCENTILE)
+    dark = counts[usable]
+    background = np.percentile(dark, BACKGROUND_PERCENTILE) + BELOW_SIGMAS * read_noise(dark)
     found = _unevenness(lenses.sums(np.where(usable, counts - background, 0.0)), counted)
 
     # As real ones, the known tracers are around the volume, too, as far as their light reaches it.
