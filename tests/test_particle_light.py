@@ -16,16 +16,20 @@ from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media
 from lfpiv_cli.particles import search
 from lfpiv_cli.particles.fitting import add_all
+from lfpiv_cli.particles.least_squares import observation_of
 from lfpiv_cli.particles.microlens_focus import FEWEST_PARTICLES, FocalLength, focal_length_of
 from lfpiv_cli.particles.search import (
     MUCH_LEFT,
+    TAKEN_UP,
     blank,
     changes_of_light,
     grown,
     light_left,
+    missing_light,
     noise_with,
     rebuilt,
     result,
+    with_other_places,
 )
 from lfpiv_cli.particles.view import View, raw_view
 from lfpiv_cli.verbs.frames import Bench, bench_of, frame_notices
@@ -65,6 +69,64 @@ def test_errors_grow_where_light_is_left_and_most_in_depth(view: View) -> None:
     assert np.all(growth[1] > growth[0])
 
 
+def test_errors_do_not_grow_for_what_is_noise(view: View) -> None:
+    particles, covariance = np.array([[0.0, 0.0, 3.0, 1e5]]), np.eye(4)[np.newaxis]
+    known = [grown(view, particles, covariance, 2.0 * MUCH_LEFT, alike)[0, 2, 2] for alike in (0.0, 0.1, 0.2, 1.0)]
+    assert known[0] == 1.0
+    assert 1.0 < known[1] < known[2] == known[3]
+
+
+def test_variances_grow_with_what_the_best_ones_do_not_leave(rng: np.random.Generator) -> None:
+    # By noise alone chi-squared of 330 pixels scatters by a thirteenth, and nothing is missing.
+    noise = rng.chisquare(330, 2000) / 330
+    assert np.mean(missing_light(noise, noise, 330.0)) < 1.3
+    # One by itself tells no other reference than 1.
+    assert missing_light(np.array([0.9]), np.array([0.9]), 330.0) == pytest.approx(1.0)
+    assert missing_light(np.zeros(0), np.array([4.0]), 330.0) == pytest.approx(1.0 + TAKEN_UP, rel=0.1)
+    # In crowds noise seems four times as large as it is, and 1 is no good particle's chi-squared.
+    crowd = np.concatenate([0.25 * noise[:200], rng.lognormal(1.0, 1.5, 800)])
+    at_best, at_one, at_hundred = missing_light(crowd, np.array([0.25, 1.0, 100.0]), 330.0)
+    assert at_best < 1.5
+    assert at_one == pytest.approx(1.0 + TAKEN_UP, rel=0.2)
+    assert at_hundred == pytest.approx(1.0 + 19.0 * TAKEN_UP, rel=0.2)
+
+
+def with_others(view: View, place: tuple[float, ...], light: float, noise: Floats) -> tuple[Floats, bool]:
+    """Return standard errors (4,) that cover other places, where they were small, and whether there is another depth.
+
+    `noise` (pixels,) is of the image in standard errors.
+    """
+    particle, image = np.array([[*place, light]]), np.zeros(view.camera.rows * view.camera.columns)
+    add_all(view, particle, 1.0, image, DEPTHS)
+    variance = READ_COUNTS**2 + 2.0 * image
+    residual = noise * np.sqrt(variance)
+    observation = observation_of(view, residual.copy(), 1.0 / variance, DEPTHS)
+    covariance = np.diag(np.square([*SURE_MM, 0.01 * light]))[np.newaxis]
+    found, other = with_other_places(observation, particle, covariance, np.ones(1), 0.0)
+    np.testing.assert_allclose(observation.residual, residual, atol=1e-6)
+    return np.sqrt(np.diagonal(found[0])), bool(other[0])
+
+
+def test_errors_cover_another_depth_that_explains_the_light(view: View, rng: np.random.Generator) -> None:
+    noise = rng.normal(size=view.camera.rows * view.camera.columns)
+    # In the middle of a lens, which holds all of its light, half a millimetre further off will do as well.
+    sigma, ambiguous = with_others(view, (0.0, 0.0, 0.25), 3e4, noise)
+    assert ambiguous
+    assert 0.3 < 1.96 * sigma[2] < 0.8
+    # Between two lenses, and where many are lit, one place alone.
+    for place in ((0.04, 0.02, 0.4), (0.0, 0.0, 1.1)):
+        sigma, ambiguous = with_others(view, place, 3e5, noise)
+        assert not ambiguous
+        np.testing.assert_allclose(sigma[:3], SURE_MM)
+
+
+def test_errors_cover_the_lens_that_holds_all_of_the_light(view: View) -> None:
+    # The other end of where it may be lies 0.03 mm off.
+    for axis, place in enumerate(((0.015, 0.0, 0.0), (0.0, 0.015, 0.0))):
+        sigma, _ = with_others(view, place, 2e4, np.zeros(view.camera.rows * view.camera.columns))
+        assert 0.03 < 1.96 * sigma[axis] < 0.06
+
+
 @pytest.mark.thorough
 def test_errors_do_not_grow_for_tracers_lost_elsewhere(table2: Camera, water: Media, rng: np.random.Generator) -> None:
     true = np.array([[-0.6, 0.0, 1.5, 5e5], [0.6, 0.0, 1.5, 5e5]])
@@ -99,6 +161,8 @@ def test_changes_are_those_of_independent_errors(view: View, monkeypatch: pytest
 
 DEPTHS = (-3.0, 3.0)
 READ_COUNTS = 6.0
+# Standard errors of a particle in many lenses.
+SURE_MM = (1e-4, 1e-4, 5e-3)
 
 
 @pytest.fixture

@@ -13,6 +13,7 @@ from lfpiv_cli.names import ColumnAxis, Layout
 from lfpiv_cli.optics.camera import Camera, Lattice
 from lfpiv_cli.optics.media import Media
 from lfpiv_cli.optics.tracing import ObjectSpace
+from lfpiv_cli.optics.waves import Waves
 from lfpiv_cli.particles.fitting import add_all
 from lfpiv_cli.particles.joining import boxes_of, explain_rest, find_peaks
 from lfpiv_cli.particles.rounds import ROUNDS, find_particles, first_pass, first_typical_light
@@ -245,7 +246,7 @@ def test_typical_light_is_not_the_noise_s_and_peaks_have_light() -> None:
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("seed", [0, 1, 5])
 def test_crowded_tracers_are_told_apart_and_their_errors_are_covered(table2: Camera, water: Media, seed: int) -> None:
     # 1.5 for each microlens within 1.9 mm: many have one peak, and the image's own noise alone tells them apart.
     rng = np.random.default_rng(seed)
@@ -256,7 +257,37 @@ def test_crowded_tracers_are_told_apart_and_their_errors_are_covered(table2: Cam
     sigma = np.sqrt(np.diagonal(found.covariance_mm2, axis1=1, axis2=2))
     places = task.camera.to_image_axes(true[:, :3])
     figures = particle_figures(found.position_mm, places, low, high, 0.1, sigma)
-    # Without the last checks 0.78 and 0.80 were found, and 0.55 to 0.68 of their errors covered.
+    # Without the last checks 0.78 and 0.80 of the first two were found, and 0.55 to 0.68 of their errors covered; with
+    # errors that grow with chi-squared itself, from 1 on, 0.80 to 0.95 in place of 0.88 to 0.98.
     assert figures["recall"] > 0.9
     assert figures["precision"] > 0.85
-    assert min(figures[f"coverage_{axis}"] for axis in "xyz") > 0.8
+    assert min(figures[f"coverage_{axis}"] for axis in "xyz") > 0.86
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize(
+    ("waves", "light", "least"),
+    [
+        (None, 2e4, 0.8),
+        # Of another physics than is fitted: 0.45 of the depths were covered.
+        (Waves(532e-6), 1e5, 0.5),
+    ],
+)
+def test_errors_of_single_tracers_near_the_focal_plane_are_covered(
+    table2: Camera, water: Media, waves: Waves | None, light: float, least: float
+) -> None:
+    camera = replace(table2, columns=150, rows=150)
+    weights = weights_of(camera, water, Grid.centred((5, 5, 50), (0.1, 0.1, 0.2), (0.0, 0.0, 0.0)))
+    view, sums = raw_view(camera, water, 0.025), normalisers(weights.padded)
+    space, over_sigma = ObjectSpace(water, None, "paraxial"), []
+    for seed in range(100, 112):
+        rng = np.random.default_rng(seed)
+        true = rng.uniform((-0.1, -0.1, -0.8), (0.1, 0.1, 0.8), (1, 3))
+        image = with_noise(render_points(camera, space, Balls(true, light, 0.05), rng, waves=waves, rays=100_000), rng)
+        found = find_particles(task_of(np.rint(image).astype(np.float32), view, weights, camera, sums))
+        assert len(found.position_mm) >= 1
+        over_sigma.append((found.position_mm[0] - true[0]) / np.sqrt(np.diagonal(found.covariance_mm2[0])))
+    # Of twelve within two binomial standard errors of what many show: 0.97, and 0.77 by waves.
+    assert np.all(np.mean(np.abs(over_sigma) < 1.96, axis=0) >= least)
+    # Nor are errors stated that are much too large: three to five times they were.
+    assert np.all(np.median(np.abs(over_sigma), axis=0) > 0.3)

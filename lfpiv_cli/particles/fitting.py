@@ -258,6 +258,56 @@ def _fit_again(
         add_light(pixels, values, -best[0, 3], residual)
 
 
+def other_ends(
+    observation: Observation, particles: Floats, chosen: NDArray[np.bool_], places: Floats, effort: Effort
+) -> tuple[Floats, Floats]:
+    """Return where fits of the chosen ones of particles (n, 4) end that begin at other places (n, k, 3).
+
+    A place is one sideways at the particle's depth, and the depth to which its line of sight is followed from there.
+    Returned are the ends (n, k, 4), and by how much chi-squared is larger there than where they are (n, k), infinite
+    for those that are not chosen. The residual is in place again on return.
+    """
+    ends, rises = np.zeros((*places.shape[:2], UNKNOWNS)), np.full(places.shape[:2], np.inf)
+
+    def work(numbers: NDArray[np.int64]) -> None:
+        _other_ends(observation, particles, numbers[chosen[numbers]], places, effort, ends, rises)
+
+    over_tiles(work, observation.optics, particles, observation.depths_mm)
+    return ends, rises
+
+
+@njit(cache=True, nogil=True)
+def _other_ends(
+    observation: Observation,
+    particles: Floats,
+    numbers: NDArray[np.int64],
+    places: Floats,
+    effort: Effort,
+    ends: Floats,
+    rises: Floats,
+) -> None:
+    """Do the work of `other_ends` for the particles of a tile."""
+    view, residual, weight = observation.optics, observation.residual, observation.weight
+    responses, prior = room_for(1, observation.capacity, 0), np.zeros((1, 2 * UNKNOWNS))
+    for number in numbers:
+        own, depth = particles[number : number + 1], particles[number, 2]
+        respond_all(view, own, responses)
+        pixels, values = lit_by(responses, 0)
+        add_light(pixels, values, own[0, 3], residual)
+        before = change_by(pixels, values, own[0, 3], residual, weight)
+        for k in range(places.shape[1]):
+            end, place = ends[number, k : k + 1], places[number, k]
+            end[0, 0], end[0, 1] = on_line_of_sight(view, place[0], place[1], depth, place[2])
+            end[0, 2] = place[2]
+            respond_all(view, end, responses)
+            pixels, values = lit_by(responses, 0)
+            end[0, 3] = best_light(pixels, values, residual, weight)
+            rises[number, k] = fit(observation, end, prior, responses, effort) - before
+        respond_all(view, own, responses)
+        pixels, values = lit_by(responses, 0)
+        add_light(pixels, values, -own[0, 3], residual)
+
+
 def nothing_expected(count: int) -> Floats:
     """Return the prior (n, 8) of particles of which nothing is known but their image, see `least_squares.fit`."""
     return np.zeros((count, 2 * UNKNOWNS))

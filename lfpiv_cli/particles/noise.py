@@ -28,9 +28,9 @@ ROUNDING_COUNTS = 0.29
 # While particles are sought, dark pixels are not trusted beyond this share of what a typical particle's pixels hold: a
 # candidate a third of a microlens off lights dark pixels, and must not go out for it in an image with hardly any noise.
 LEAST_SHARE_OF_LIT = 0.003
-# Pixels are lit above this many standard deviations of the read noise; what lies further than so many from the model is
-# light that was not found, not an error's usual size.
-LIT_SIGMAS, USUAL_SIGMAS = 3.0, 3.5
+# Pixels are lit above this many standard deviations of the read noise. What lies further than so many from the model
+# counts as no further: light that was not found, about a few particles, tells nothing of the errors of all others.
+LIT_SIGMAS, USUAL_SIGMAS = 3.0, 1.0
 # Distances in pixels at which errors are compared: from where white noise has ended to within a micro-image.
 LAGS_PX = range(1, 9)
 # Lit pixels are sorted by brightness into so many classes, of at least so many pixels, to see how their errors grow. A
@@ -133,7 +133,7 @@ def measured_noise(model: Floats, residual: Floats, usable: NDArray[np.bool_], n
     """
     lit = usable & (model > LIT_SIGMAS * noise.read_counts)
     number = min(CLASSES, int(np.count_nonzero(lit)) // SMALLEST_CLASS)
-    if number < FEWEST_CLASSES:
+    if number < 1:
         return noise
     light, left = model[lit], residual[lit]
 
@@ -145,13 +145,15 @@ def measured_noise(model: Floats, residual: Floats, usable: NDArray[np.bool_], n
     # Small integers are sorted in one pass.
     parts = np.split(np.argsort(member, kind="stable"), np.cumsum(np.bincount(member, minlength=number))[:-1])
     classes = [part for part in parts if 2 * part.size >= SMALLEST_CLASS]
-    if len(classes) < FEWEST_CLASSES:
+    if not classes:
         return noise
     brightness = np.array([np.mean(light[members]) for members in classes])
     variance = np.array([np.median(left[members] ** 2) for members in classes]) / HALF_NORMAL_MEDIAN**2
     if not np.all(variance > 0.0):
         return noise
     terms = np.column_stack([brightness, brightness**2])
+    if len(classes) < FEWEST_CLASSES:
+        terms[:, 1] = 0.0
     # A variance is as sure as it is large.
     (gain, error2), _ = nnls(terms / variance[:, np.newaxis], 1.0 - noise.read_counts**2 / variance)
     return Noise(noise.read_counts, float(gain), float(np.sqrt(error2)))

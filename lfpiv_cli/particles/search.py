@@ -13,12 +13,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
+from scipy.special import ndtri
 
 from lfpiv_cli.arrays import Floats
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.particles.covariance import joint_covariance
-from lfpiv_cli.particles.fitting import add_all, judge, nothing_expected, refine
-from lfpiv_cli.particles.least_squares import SMALLEST_GAIN, Observation, observation_of
+from lfpiv_cli.particles.fitting import add_all, judge, nothing_expected, other_ends, refine
+from lfpiv_cli.particles.least_squares import CHOICE_GAIN, SMALLEST_GAIN, Effort, Observation, observation_of
 from lfpiv_cli.particles.noise import (
     LEAST_SHARE_OF_LIT,
     LIT_SIGMAS,
@@ -83,11 +84,15 @@ LAST_SWEEPS, LAST_UNEXPLAINED = 4, 0.02
 SMALLEST_LIGHT = 0.3
 # A particle stays while at least this much of it meets the sensor.
 SMALLEST_SEEN = 0.1
-# A good particle's chi-squared is the one at this percentile, for errors at most 1: crowds make noise seem larger than
-# it is. What others exceed it by is light of neighbours that were not found, or wrongly; a particle takes up some of
-# that itself, and it counts as so many times as much. Single frames of 0.4 to 1.2 tracers per microlens are covered by
-# that.
-GOOD_PERCENTILE, TAKEN_UP = 20.0, 2.0
+# A good particle's chi-squared is the one at this percentile.
+GOOD_PERCENTILE = 20.0
+# For errors it is that of the particles that fit best, at most 1: crowds make noise seem larger than it is. What others
+# exceed it by is light of neighbours that were not found, or wrongly. A particle takes up most of what is like its own
+# light, and shows the less of it; so their variance grows with the root of chi-squared, by this factor: of tracers at
+# twice the best ones' chi-squared it is six times as large, of those at a hundred times a hundred times.
+BEST_PERCENTILE, TAKEN_UP = 5.0, 12.0
+# Particles of which so much is seen tell what fits best.
+LEAST_SEEN = 0.5
 # Lengths are in the camera's own units (`Scale`): microlenses laterally, depths over which light spreads by one lens
 # (Table 2: 0.04, 0.25 and 0.3 mm).
 # Two particles this close, laterally and in depth, are in one place.
@@ -108,6 +113,7 @@ class Particles:
     covariance_mm2 : (n, 3, 3) of the position, the camera taken to be as calibrated
     chi2 : (n,) mean of residual^2 / variance over the particle's light, about 1 where all is explained
     seen : (n,) share of its light that meets the sensor
+    ambiguous : (n,) whether another depth explains its light about as well
     residual : (rows, columns) what the particles leave of the image, counts
     noise : of the image
     """
@@ -118,6 +124,7 @@ class Particles:
     covariance_mm2: Floats
     chi2: Floats
     seen: Floats
+    ambiguous: NDArray[np.bool_]
     residual: Floats
     noise: Noise
 
@@ -341,6 +348,21 @@ def usual_chi2(chi2: Floats) -> float:
     return float(np.percentile(chi2, GOOD_PERCENTILE)) if chi2.size else 1.0
 
 
+def missing_light(known: Floats, chi2: Floats, pixels: float) -> Floats:
+    """Return by what factor light that was not found raises the variance of particles with chi-squared (n,), 1 or more.
+
+    Parameters
+    ----------
+    known : (m,) chi-squared of particles that are well seen
+    pixels : over which a particle's light is spread: of as many, noise alone scatters chi-squared
+    """
+    scatter = float(np.sqrt(2.0 / pixels))
+    best = float(np.percentile(known, BEST_PERCENTILE)) if known.size else 1.0
+    # The best ones of many are by chance below what noise makes.
+    best = min(best / (1.0 + scatter * ndtri(0.01 * BEST_PERCENTILE)), 1.0) * (1.0 + scatter)
+    return np.asarray(1.0 + TAKEN_UP * (np.sqrt(np.maximum(chi2 / best, 1.0)) - 1.0))
+
+
 def result(task: Task, state: State) -> Particles:
     """Return the particles in world axes, brightest first."""
     shape = task.prepared.shape
@@ -354,12 +376,13 @@ def result(task: Task, state: State) -> Particles:
     changes = None
     if task.light_covariance is not None:
         changes = changes_of_light(task.view, particles, task.light_covariance, task.depths_mm)
-    missing = 1.0 + TAKEN_UP * np.maximum(chi2 / min(usual_chi2(chi2), 1.0) - 1.0, 0.0)
+    missing = missing_light(chi2[seen > LEAST_SEEN], chi2, lens_pixels(task.view))
     covariance = joint_covariance(observation, particles, correlation, missing, changes)
     # Where there is a model: elsewhere is the light of particles that were not found.
     lit = task.usable & (task.image - state.residual > LIT_SIGMAS * state.noise.read_counts)
     share = light_left(task.image[lit], state.residual[lit], state.noise.read_counts)
-    covariance = grown(task.view, particles, covariance, share)
+    covariance = grown(task.view, particles, covariance, share, correlation.share)
+    covariance, ambiguous = with_other_places(observation, particles, covariance, chi2, correlation.share)
     to_world = task.camera.to_image_axes(np.eye(3))
     return Particles(
         position_mm=task.camera.to_image_axes(particles[:, :3]),
@@ -368,6 +391,7 @@ def result(task: Task, state: State) -> Particles:
         covariance_mm2=to_world @ covariance[:, :3, :3] @ to_world.T,
         chi2=chi2,
         seen=seen,
+        ambiguous=ambiguous,
         residual=state.residual.reshape(shape),
         noise=state.noise,
     )
@@ -381,6 +405,8 @@ def result(task: Task, state: State) -> Particles:
 # Where particles leave this share of an image's light, its noise taken off, more than at any crowd at which most are
 # found, the model of light is wrong, or tracers are missing. Beyond, its errors are alike in all lenses, first in part.
 MUCH_LEFT = 0.1
+# Where less than this share of it is alike in pixels side by side, it is noise in part.
+MUCH_ALIKE = 0.2
 
 
 def changes_of_light(view: View, particles: Floats, covariance: Floats, depths_mm: tuple[float, float]) -> Floats:
@@ -415,17 +441,85 @@ def light_left(image: Floats, residual: Floats, read_counts: float) -> float:
     return float(np.sqrt(max(np.sum(residual**2) - residual.size * read_counts**2, 0.0) / light)) if light else 0.0
 
 
-def grown(view: View, particles: Floats, covariance: Floats, left: float) -> Floats:
+def grown(view: View, particles: Floats, covariance: Floats, left: float, likeness: float = 1.0) -> Floats:
     """Return covariances (n, 4, 4) of particles (n, 4) that leave a share of the light, larger where it is much.
+
+    `likeness` is the share of that which is alike in pixels side by side: what a model gets wrong is, noise is not.
 
     What a model gets wrong is alike in all lenses that a particle lights: for depth and light it adds up from lens to
     lens. Sideways lenses on either side of the spot make up for each other, and as much is taken to be left as goes
     with the spot's diameter.
     """
-    alike = float(np.clip((left / MUCH_LEFT) ** 2 - 1.0, 0.0, 1.0))
+    alike = float(np.clip((left / MUCH_LEFT) ** 2 - 1.0, 0.0, 1.0)) * min(likeness / MUCH_ALIKE, 1.0)
     radius = 0.5 * footprint_radius_mm(view, particles) / np.sqrt(view.half_x_mm * view.half_y_mm)
     # Cells that a disc touches, on the mean.
     lenses = 1.0 + 4.0 * radius + np.pi * radius**2
     deep, sideways = np.sqrt(1.0 + alike * lenses), np.sqrt(1.0 + alike * np.sqrt(lenses))
     growth = np.stack([sideways, sideways, deep, deep], axis=-1)
     return np.asarray(covariance * growth[:, :, np.newaxis] * growth[:, np.newaxis, :])
+
+
+# Other places that explain a particle's light about as well.
+#
+# Near the focal plane, where one lens or two hold most of a particle's light, either sign of depth may explain it, and
+# within one lens any place sideways that lights no other. What is stated is to cover them all: a fit that ends in
+# another place with little more chi-squared is weighed by its likelihood.
+#
+# Axes: image axes, mm.
+
+
+# Particles nearer to the focal plane than this, in depths over which light spreads by one lens, are tried at their
+# place mirrored in the middle of their lens along either axis, from their mirrored depth and from these others.
+NEAR_DEPTHS, OTHER_DEPTHS = 0.9, np.array([-0.6, 0.0, 0.6])
+# Steps of each of these fits.
+OTHER_STEPS = 6
+# Another place is one beyond so many stated errors, squared, where chi-squared rises by less than half of what they
+# let expect, and by so much at most: it is one in twenty that the particle is there.
+ELSEWHERE_SIGMAS2, LARGEST_RISE = 4.0, 6.0
+
+
+def with_other_places(
+    observation: Observation, particles: Floats, covariance: Floats, chi2: Floats, alike: float
+) -> tuple[Floats, NDArray[np.bool_]]:
+    """Return covariances (n, 4, 4) that cover the other places of particles (n, 4), and which have another depth (n,).
+
+    Parameters
+    ----------
+    chi2 : (n,) local ones
+    alike : share of what is left that is alike in pixels side by side: what the model gets wrong. It is taken to be
+        alike in all pixels of a lens, and what they say of one place against another counts for as much less
+    """
+    view = observation.optics
+    near = np.abs(particles[:, 2]) < NEAR_DEPTHS * view.scale.depth_mm
+    if not near.any():
+        return covariance, near
+    centres, on_array = view.centres_mm.reshape(-1, 2), on_array_mm(view, particles)
+    beside = on_array - centres[KDTree(centres).query(on_array)[1]]
+    places = np.repeat(particles[:, np.newaxis, :3], 3 + OTHER_DEPTHS.size, axis=1)
+    for axis in range(2):
+        # The image of a place moves against it.
+        places[:, axis, axis] += 2.0 * beside[:, axis] * view.camera.focus_distance_mm / view.camera.image_distance_mm
+    places[:, 2, 2] *= -1.0
+    places[:, 3:, 2] = OTHER_DEPTHS * view.scale.depth_mm
+    places[:, :, 2] = np.clip(places[:, :, 2], *observation.depths_mm)
+
+    # Sideways also as they are: within a lens hardly anything leads a fit back.
+    still = other_ends(observation, particles, near, places[:, :2], Effort(0, 0.0))
+    fitted = other_ends(observation, particles, near, places, Effort(OTHER_STEPS, CHOICE_GAIN))
+    ends, rises = (np.concatenate(both, axis=1) for both in zip(still, fitted, strict=True))
+
+    rises = np.maximum(rises, 0.0) / (np.maximum(chi2, 1.0) * (1.0 + alike * lens_pixels(view)))[:, np.newaxis]
+    off = ends - particles[:, np.newaxis]
+    sigmas2 = np.einsum("nki,nij,nkj->nk", off, np.linalg.inv(covariance), off)
+    other = (sigmas2 > ELSEWHERE_SIGMAS2) & (rises < np.minimum(0.5 * sigmas2, LARGEST_RISE))
+    likely = np.where(other, 1.0 / (1.0 + np.exp(0.5 * np.minimum(rises, LARGEST_RISE))), 0.0)
+    wider = covariance.copy()
+    # Several may be one place: along each axis the one that matters most counts.
+    for axis, starts in enumerate((slice(0, 4, 2), slice(1, 4, 2), slice(4, None))):
+        matters = likely[:, starts] * off[:, starts, axis] ** 2
+        most = np.argmax(matters, axis=1)[:, np.newaxis]
+        step = np.take_along_axis(off[:, starts], most[:, :, np.newaxis], axis=1)[:, 0]
+        wider += np.take_along_axis(likely[:, starts], most, axis=1)[:, :, np.newaxis] * (
+            step[:, :, np.newaxis] * step[:, np.newaxis, :]
+        )
+    return wider, other[:, 4:].any(axis=1)

@@ -329,6 +329,7 @@ def points_of(bench: Bench, frame: Frame, found: Particles, size: TracerSize, pr
             "excluded_pixels": int(np.count_nonzero(frame.unusable)),
             "read_noise_counts": found.noise.read_counts,
             "particles_per_lens": float(np.count_nonzero(inside)) / lenses,
+            "depth_ambiguous": float(np.mean(found.ambiguous[inside])) if inside.any() else 0.0,
         }
         | ({} if number is None else {"tracers_per_lens": number})
         | ({} if focus is None else {"microlens_focus": focus.off, "microlens_focus_sigma": focus.sigma})

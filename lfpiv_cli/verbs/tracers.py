@@ -19,6 +19,8 @@ LARGEST_UNEXPLAINED = 0.2
 # At so many found for each microlens stated errors begin to cover less than .85: of 1.6 tracers as many are found, and
 # .88 to .94 covered; of 2, of which 1.5 to 1.8 are found, .6 to .7.
 LARGEST_CROWD = 1.4
+# Of tracers at all depths of a usual volume one in seven at most has another depth that fits about as well, in crowds.
+MOST_AMBIGUOUS = 0.25
 # Microlenses whose focal length is off by a larger share are told: depths are off by some three stated errors for each
 # per cent. Good ones seem up to 0.002 off, and more the more light is left, and the more tracers there are for each
 # microlens from one on.
@@ -210,6 +212,21 @@ def light_notices(points: Points, name: str) -> list[Notice]:
                 "fewer tracers, or volumes and their correlation; --background, where other light is in the image",
                 crowd,
                 f"at most {LARGEST_CROWD:g}",
+            )
+        )
+    ambiguous = measured.get("depth_ambiguous", 0.0)
+    if ambiguous > MOST_AMBIGUOUS:
+        notices.append(
+            Notice(
+                "depth-ambiguous",
+                name,
+                f"another depth explains the light of {ambiguous:.0%} of the particles about as well, at most "
+                f"{MOST_AMBIGUOUS:.0%} of usual tracers': near the focal plane one lens or two hold it all. Their "
+                "stated errors cover both depths",
+                "a volume that lies beside the focal plane, or more light; reconstruction.wavelength_nm, as lenses "
+                "diffract",
+                ambiguous,
+                f"at most {MOST_AMBIGUOUS:g}",
             )
         )
     off, largest = measured.get("microlens_focus", 0.0), LARGEST_FOCUS_ERROR * max(unexplained / MUCH_LEFT, crowd, 1.0)
