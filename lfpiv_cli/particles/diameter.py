@@ -97,6 +97,9 @@ LIMIT_SIGMAS = 3.0
 # Tracers that are enough, of so many images where there are as many; and where there are none, the diameter that is
 # taken.
 ENOUGH, FEWEST_FRAMES, UNKNOWN_LENSES = 10, 2, 0.5
+# The share of the brightest tracers that must stand alone: of ten of forty that do so where six lie before each
+# microlens, the others are more, and what they lack made 0.72 microlenses of 0.5. Of up to 1.5 all do, of four none.
+ALONE_SHARE = 0.5
 # Only noise is left around a tracer whose chi-squared per pixel is at most this: 1 to 2.3 with the right size and the
 # neighbours found, 4 to 500 where neighbours are missing.
 NOISE_ALONE = 3.0
@@ -324,7 +327,7 @@ def _settled_sizes(sought: Sought, diameter: float, rounds: Sequence[Round]) -> 
 
 def _enough(alone: NDArray[np.bool_]) -> bool:
     """Return whether noise is all that is left around enough of the tracers (n,)."""
-    return bool(np.count_nonzero(alone) >= max(min(ENOUGH, 0.5 * alone.size), 1))
+    return bool(alone.any() and np.count_nonzero(alone) >= ALONE_SHARE * alone.size)
 
 
 def _forms(task: Task, found: State, diameter: float) -> Forms:
