@@ -11,24 +11,32 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
 import pytest
+import tifffile
 
 from lfpiv_cli.console import Console
 from lfpiv_cli.errors import ConfigError, InputError, PartialError, UsageError
 from lfpiv_cli.files import listing
 from lfpiv_cli.files.batch import Frame, images_seen
 from lfpiv_cli.files.config import load_rig
+from lfpiv_cli.files.vtkhdf import write_vectors
 from lfpiv_cli.verbs import particles
+from lfpiv_cli.verbs import watch as watching
 from lfpiv_cli.verbs.batches import Failure
+from lfpiv_cli.verbs.checks import Line, Part
 from lfpiv_cli.verbs.pairs import PairOptions, coming_pairs
 from lfpiv_cli.verbs.particles import Sized
+from lfpiv_cli.verbs.report import Contents, Fields
 from lfpiv_cli.verbs.run import RIG
 from lfpiv_cli.verbs.simulate import frame_names
 from tests.commands import SAMPLE, sample_rig
 from tests.commands import run as lfpiv
 from tests.test_batch_shares import Filling
+from tests.test_report import REFERENCE, WARNING, record
 from tests.test_run import PAIR, PHOTOGRAPHS, rig_in
 from tests.test_run_shares import SMALL, data_of
+from tests.vector_fields import SHAPE, SIGMA_VOXEL, field_of
 
 HOW = ("--method", "volumes", "--no-report")
 # What `run` adds when all pairs have come, and the last pair's picture.
@@ -124,6 +132,47 @@ def test_files_are_those_of_run_and_what_is_lost_or_broken_is_told_and_passed_ov
     assert len(one) == 3 + 3 + 6
 
 
+@pytest.mark.thorough
+def test_a_first_pair_that_cannot_be_measured_is_told_and_the_next_one_is(
+    rig: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    source = named(tmp_path / "source", "1a", "1b", "2a", "2b")
+    for path in source[:2]:
+        tifffile.imwrite(path, np.arange(30, dtype=np.uint16).reshape(5, 6))
+    camera = Filling(tmp_path / "images", dict(zip((1.0, 2.0, 8.0, 9.0), source, strict=True)))
+    monkeypatch.setattr(listing, "time", camera)
+    with pytest.raises(PartialError, match="1a"):
+        watch(rig, camera.folder, tmp_path / "out", "--idle-s", 6)
+    lines = [line for line in capsys.readouterr().out.splitlines() if re.match(r"\d[ab]", line)]
+    assert re.match(r"1a.tif  failed: .*1[ab].tif: .*6 x 5 pixels", lines[0]), lines
+    assert lines[1].startswith("2a  ")
+
+
+def test_the_verdict_of_a_pair_knows_of_its_vectors_by_both_methods(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    flow = np.zeros((*SHAPE, 3))
+    flow[..., 0] = 1.0
+    paths = [tmp_path / f"{name}.vtkhdf" for name in ("vectors", "tracks_grid")]
+    for path, command in zip(paths, ("correlate", "track"), strict=True):
+        made = record(command, *((WARNING,) if command == "correlate" else ()))
+        write_vectors(path, field_of(flow, SIGMA_VOXEL), REFERENCE, provenance=made, overwrite=False)
+    verdicts: list[str] = []
+    known = watching.judged
+
+    def noted(contents: Contents, fields: Fields) -> dict[Part, list[Line]]:
+        parts = known(contents, fields)
+        verdicts.extend({line.verdict for line in parts["vectors"]})
+        return parts
+
+    monkeypatch.setattr(watching, "judged", noted)
+    watching.Latest(tmp_path, Console(), draws=False).measured("p1_a", 0.5, paths, paths[1], 2.0)
+    assert verdicts == ["good"]
+    # 1 mm in 1 ms; of 0.05, 0.02 and 0.4 voxel of 0.1, 0.2 and 0.3 mm
+    words = "0.5 per microlens  990 vectors  u 1.0000 ± 0.005  v 0.0000 ± 0.004  w 0.0000 ± 0.12 m/s  look  2.0 s"
+    assert capsys.readouterr().out == f"p1_a  {words}\n"
+
+
 def begun(rig: Path, folder: Path, output: Path, *options: object) -> subprocess.Popen[str]:
     """Start a command that watches."""
     words = ["run", rig, "--watch", folder, *PHOTOGRAPHS, "--method", "volumes", *options, "-o", output]
@@ -155,9 +204,12 @@ def test_an_interrupted_watch_keeps_what_is_done_and_goes_on(rig: Path, tmp_path
         lines_until(process, "1a")
         first = output / "vectors" / "1a.vtkhdf"
         before = first.stat().st_mtime_ns
-        time.sleep(2.0)  # its picture
+        until = time.monotonic() + 120.0
+        while not (output / "latest.html").exists() and time.monotonic() < until:
+            time.sleep(0.2)
         process.send_signal(signal.SIGINT)
-        assert process.wait(timeout=5.0) == 130
+        # That a signal is answered within seconds is tested of all commands; here others may keep the processor busy.
+        assert process.wait(timeout=60.0) == 130
     finally:
         process.kill()
         process.communicate()

@@ -123,13 +123,13 @@ class Watching:
         """Measure pairs; the first ones when the tracers' size is known, or no others are to come."""
         self._every += pairs
         self._waiting += pairs
-        if not self._waiting or not self._is_ready(last):
+        if not self._waiting or not self._is_ready(last) or self._choice is None:
             return
         waiting, self._waiting = self._waiting, []
         kept = 0
         # Pages of one file belong to pairs that are measured together.
         for _, those in groupby(waiting, key=lambda pair: {frame.path for frame in pair}):
-            kept += self._measure(list(those))
+            kept += self._measure(list(those), self._choice)
         if kept:
             self.console.say(f"{kept} pairs are complete and kept")
 
@@ -139,8 +139,11 @@ class Watching:
         if self._choice is None:
             try:
                 self._choice = chosen(self.settings, self.options, lambda: counted(chain, self._weights))
-            except InputError:
-                return True  # its turn tells it
+            except InputError as error:
+                for pair in self._waiting:
+                    self._latest.failed(pair[0].path.name, str(error))
+                self._waiting = []
+                return False
             self.console.say(f"by {' and '.join(self._choice.methods)}: {self._choice.reason}")
             self._latest.begin()
         if "particles" not in self._choice.methods or self._prepared.size is not None:
@@ -155,12 +158,12 @@ class Watching:
         self._prepared.size = found
         return True
 
-    def _measure(self, pairs: Together) -> int:
+    def _measure(self, pairs: Together, choice: Choice) -> int:
         """Take pairs through all steps, and tell of each; return how many were complete before."""
         begun, name = time.monotonic(), pairs[0][0].path.name
         chain = self._chain(pairs, self._quiet, recorded=False)
         try:
-            fields = measured(chain, self._choice, self._weights) if self._choice else {}
+            fields = measured(chain, choice, self._weights)
         except InputError as error:
             fields = {}
             chain.failures = chain.failures or [Failure(name, str(error))]
@@ -216,9 +219,10 @@ class Latest:
         self, name: str, tracers_per_lens: float | None, made: Sequence[Path], vectors: Path, seconds: float
     ) -> None:
         """Tell of a pair whose files are `made`, and draw its vectors."""
-        flow = open_vectors(vectors)
+        contents = contents_of(self.output, made)
+        fields = {path: open_vectors(path) for path in contents.of("vectors")}
+        flow, parts = fields[vectors], judged(contents, fields)
         mean, sigma = checks.velocity_of(flow)
-        parts = judged(contents_of(self.output, made), {vectors: flow})
         verdict = checks.worst((line for lines in parts.values() for line in lines), "good")
         cells = (
             UNKNOWN if tracers_per_lens is None else written(tracers_per_lens, 2),
@@ -250,8 +254,8 @@ class Latest:
         if flow is not None:
             write_picture(picture, planes_figure(flow), overwrite=True)
         shown = (Picture(picture, "The last pair that was measured"),) if picture.exists() else ()
-        table = Table("Pairs, the last one first", HEAD, tuple(self._rows))
+        table = Table("The last one first", HEAD, tuple(self._rows))
         foot = f"Renews itself every {RELOAD_S} s; velocities are means, ± the usual standard error of one vector."
-        section = Section("The last pair", "latest", pictures=shown)
-        page = Page(f"{name}  {line}", (), (table,), (section,), foot, reload_s=RELOAD_S)
+        sections = (Section("The last pair", "latest", pictures=shown), Section("Pairs", "pairs", tables=(table,)))
+        page = Page(f"{name}  {line}", (), (), sections, foot, reload_s=RELOAD_S)
         write_pages(page, [self.output / PAGE], overwrite=True)
