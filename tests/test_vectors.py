@@ -152,16 +152,30 @@ def paths_in(count: int, share: float, rng: np.random.Generator) -> Paths:
     return Paths(points, np.tile((0.05, 0.0, 0.0), (count, 1)), np.full((count, 3), 0.002))
 
 
-@pytest.mark.thorough
 @pytest.mark.parametrize("count", [200, 1000])
 def test_a_region_without_tracks_has_no_vectors(count: int, rng: np.random.Generator) -> None:
-    field = vectors_from_paths(paths_in(count, 0.6, rng), WINDOWS, None)
+    paths = paths_in(count, 0.6, rng)
+    field = vectors_from_paths(paths, WINDOWS, None)
     low, high = VOLUME.bounds_mm(0)
     away = field.grid.axis_mm(0) - (low + 0.6 * (high - low))
-    # Nearer than the tracks are to each other nobody can tell.
-    assert np.all(field.flag[:, :, away > (0.5 if count == 1000 else 0.9)] == REJECTED)
+    # From where a window, 0.8 mm wide, no longer reaches the tracks; the last of few lie up to 0.2 mm inside.
+    assert np.all(field.flag[:, :, away > (0.4 if count == 1000 else 0.6)] == REJECTED)
     assert np.isnan(field.displacement_voxel[field.flag == REJECTED]).all()
     assert np.all(field.flag[:, :, away < 0.0] == VALID)
+    # No window that holds a track loses its vector, wherever it is.
+    off = np.abs(field.grid.centres_mm()[..., np.newaxis, :] - paths.middle_mm) / WINDOWS.sides_mm
+    assert np.all(field.flag[np.any(np.all(off < 0.5, axis=-1), axis=-1)] == VALID)
+
+
+def test_a_layer_without_tracks_has_no_vectors(rng: np.random.Generator) -> None:
+    """As thick as a window, where a cube of what would hold many tracks reaches into those beside it."""
+    paths = paths_in(3000, 1.0, rng)
+    away = np.abs(paths.middle_mm[:, 1]) > 0.41
+    field = vectors_from_paths(Paths(*(each[away] for each in vars(paths).values())), WINDOWS, None)
+    beside = np.abs(field.grid.axis_mm(1))
+    assert np.count_nonzero(beside < 0.01) == 1
+    assert np.all(field.flag[:, beside < 0.01] == REJECTED)
+    assert np.all(field.flag[:, beside > 0.01] == VALID)
 
 
 @pytest.mark.parametrize("count", [80, 300, 3000])

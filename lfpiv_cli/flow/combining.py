@@ -16,6 +16,7 @@ Axes: arrays `[z, y, x]`, components last; displacements in voxels.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -200,9 +201,11 @@ def _of_one(first: Floats, second: Floats, used: Flags) -> Floats:
 # A vector needs its twelve nearest tracks within this many windows of its centre: in sparse images tracks are further
 # apart than windows, and what a wide fit misses of the flow is in the stated error.
 REACH_WINDOWS = 2.0
-# A vector lies in a region without tracers where so many tracks would be expected nearer than the nearest one is: by
-# chance alone one vector in a million would; where half of the tracers are found, one in a thousand.
+# A vector lies in a region without tracers where so many tracks would be expected in a box that holds none: by chance
+# alone one box in a million would; where half of the tracers are found, one in a thousand. Boxes reach as far as one
+# that lets expect as many, and further, where the volume ends.
 EXPECTED_TRACKS = 14.0
+REACHES = np.array([1.0, 1.4, 2.0, 2.8, 4.0])
 # The density at a track is that of the box which reaches its sixth neighbour.
 DENSITY_NEIGHBOURS = 6
 
@@ -292,26 +295,39 @@ def vectors_from_paths(paths: Paths, windows: WindowGrid, dt_s: float | None) ->
 def without_tracks(middle_mm: Floats, nodes_mm: Floats, windows: WindowGrid) -> Flags:
     """Return which nodes (m,) lie in a region without tracks, where tracks elsewhere are as dense as they are.
 
-    A fit to the nearest tracks would only extend what the flow does beside the region. Nearness is counted in boxes of
-    the windows' proportions, as far as these lie in the volume and between the walls.
+    A fit to the nearest tracks would only extend what the flow does beside the region. A window without tracks lies in
+    one if a box does that holds it and that would hold many: about it, or to one side of it; boxes count as far as they
+    lie in the volume and between the walls.
     """
     if len(middle_mm) <= DENSITY_NEIGHBOURS:
         return np.ones(len(nodes_mm), dtype=np.bool_)
     low, high = np.array([windows.volume.bounds_mm(axis) for axis in range(3)]).T
     side_mm, walls = windows.sides_mm, windows.walls
 
-    def volume_around(points_mm: Floats, reach: Floats) -> Floats:
-        """Return the volume, mm^3, of boxes that reach so many windows far to each side."""
-        half = reach[:, np.newaxis] * side_mm
-        first, last = np.maximum(points_mm - half, low), np.minimum(points_mm + half, high)
+    def volume_of(centres_mm: Floats, half: Floats) -> Floats:
+        """Return the volume, mm^3, of boxes that reach so many windows far to each side of their centres."""
+        first, last = np.maximum(centres_mm - half * side_mm, low), np.minimum(centres_mm + half * side_mm, high)
         if walls is not None:
             return walls.volumes_mm3(first, last)
         return np.asarray(np.prod(np.maximum(last - first, 0.0), axis=1))
 
-    tree = KDTree(middle_mm / side_mm)
     # Its own place is each track's nearest.
-    sixth = tree.query(middle_mm / side_mm, k=[DENSITY_NEIGHBOURS + 1], p=np.inf)[0][:, 0]
-    around = volume_around(middle_mm, sixth)
+    tracks, nodes = middle_mm / side_mm, nodes_mm / side_mm
+    sixth = KDTree(tracks).query(tracks, k=[DENSITY_NEIGHBOURS + 1], p=np.inf)[0]
+    around = volume_of(middle_mm, sixth)
     density = np.median(DENSITY_NEIGHBOURS / around[around > 0.0])
-    nearest = tree.query(nodes_mm / side_mm, p=np.inf)[0]
-    return np.asarray(density * volume_around(nodes_mm, nearest) > EXPECTED_TRACKS)
+    # How far a cube reaches that lets expect as many.
+    reach = 0.5 * (EXPECTED_TRACKS / (density * float(np.prod(side_mm)))) ** (1.0 / 3.0)
+    without, none = np.zeros(len(nodes), dtype=np.bool_), np.zeros(3)
+    for wide in REACHES * max(reach, 1.0):
+        # About the window, no wider than it along any axes; and from its far side to one side.
+        boxes = [(np.array(half), none) for half in product((0.5, wide), repeat=3) if max(half) > 0.5]
+        for axis in np.eye(3):
+            half, aside = np.where(axis > 0.0, 0.5 * (wide + 0.5), wide), 0.5 * (wide - 0.5) * axis
+            boxes += [(half, -aside), (half, aside)]
+        for half, aside in boxes:
+            centres = nodes + aside
+            many = density * volume_of(centres * side_mm, half) > EXPECTED_TRACKS
+            empty = KDTree(tracks / half).query(centres / half, p=np.inf, distance_upper_bound=1.0)[0] > 1.0
+            without |= empty & many
+    return without
