@@ -25,7 +25,15 @@ from lfpiv_cli.errors import ConfigError, InputError
 from lfpiv_cli.flow.deformation import Spline, deform_pair, matrices_to_voxels, spline_coefficients, spline_matrix
 from lfpiv_cli.flow.field import VectorField
 from lfpiv_cli.flow.moments import MOMENTS, gauss_newton, pair_moments
-from lfpiv_cli.flow.outliers import expected_noise, fill_field, mixing, smooth_field, unresolved, validate_vectors
+from lfpiv_cli.flow.outliers import (
+    expected_noise,
+    fill_field,
+    in_tails,
+    mixing,
+    smooth_field,
+    unresolved,
+    validate_vectors,
+)
 from lfpiv_cli.flow.peaks import ELONGATED_WIDTH, Peaks, absolute, find_peaks, typical_width, undiluted
 from lfpiv_cli.flow.sums import MapSums, map_sums, margins, valid_shares
 from lfpiv_cli.flow.windows import CorrelationSettings, Triple, WindowLayout, cells_of, triple
@@ -292,9 +300,15 @@ def _refine(pairs: Sequence[Pair], predictor: Floats, step: Pass, is_elongated: 
         moments = pair_moments(a, b, valid, layout, before) if step.is_last or is_elongated else None
         parts.append((map_sums(a, b, layout, before, step.radius), fraction, moments))
     sums, fractions, moments_of = zip(*parts, strict=True)
-    peaks = find_peaks(reduce(add, sums).correlation())
+    total = reduce(add, sums)
+    peaks = find_peaks(total.correlation())
     valid_fraction = np.asarray(np.mean(fractions, axis=0, dtype=np.float64))
     width = undiluted(typical_width(peaks.width))
+    elongated = width >= ELONGATED_WIDTH
+    if step.is_last:
+        amplitude = total.amplitude() / np.sqrt(np.maximum(valid_fraction, SMALLEST_VALID_FRACTION))
+        tails = in_tails(amplitude, np.where(elongated, width / np.sqrt(2.0), 0.0), layout)
+        peaks = replace(peaks, height=np.where(tails, 0.0, peaks.height))
     rest = uncertainty = np.full(peaks.offset.shape, np.nan)
     if moments_of[0] is not None:
         rest, deviation, response = gauss_newton(reduce(add, moments_of), layout, width / np.sqrt(2.0))
@@ -302,7 +316,7 @@ def _refine(pairs: Sequence[Pair], predictor: Floats, step: Pass, is_elongated: 
     # Gauss-Newton steps take the place of offsets along elongated axes. One longer than the peak is wide lies outside
     # the range in which the volumes change linearly. Where all axes are short, steps and peaks err in part
     # independently, and a share of the step is taken; where they differ by half a voxel it has met a lost particle.
-    elongated, differ = width >= ELONGATED_WIDTH, rest - peaks.offset
+    differ = rest - peaks.offset
     elsewhere = 0.0 if elongated.any() else STEP_SHARE * (np.abs(differ) < LARGEST_DIFFERENCE)
     share = np.where(elongated, np.abs(rest) <= width, elsewhere)
     offset = np.where(share > 0.0, peaks.offset + share * differ, peaks.offset)

@@ -11,12 +11,12 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
-from scipy.ndimage import binary_dilation, correlate1d
+from scipy.ndimage import binary_dilation, correlate1d, maximum_filter1d
 
 from lfpiv_cli.arrays import Flags, Floats, Integers
 from lfpiv_cli.flow.field import MASKED, REJECTED, REPLACED, SECOND_PEAK, VALID
 from lfpiv_cli.flow.peaks import typical_width
-from lfpiv_cli.flow.windows import Triple
+from lfpiv_cli.flow.windows import Triple, WindowLayout
 from lfpiv_cli.threads import share_out
 
 # The filter between passes, and what it says of the scales that a field does not resolve.
@@ -107,6 +107,38 @@ def _filter(displacement: Floats, end: Floats) -> Floats:
             )
             filtered = np.moveaxis(line, 0, axis)
     return filtered
+
+
+# Beside tracers a window without any holds the tails of their long images, which move as they do: what is measured
+# there is the flow beside it, and looks as sure. Windows that hold many tracers have like amplitudes: all but so many
+# of those beside each other across the particles have at least a share of their neighbour's. With so much less than
+# that share, up to the largest, of one within so many standard deviations of a particle along it, one is a tail's.
+TAIL_QUANTILE, TAIL_BELOW, LARGEST_TAIL, TAIL_SIGMAS = 0.02, 0.2, 0.5, 10.0
+
+
+def in_tails(amplitude: Floats, sigma_voxel: Floats, layout: WindowLayout) -> Flags:
+    """Return which windows (nz, ny, nx) hold no more than the tails of particles in windows beside them.
+
+    Where few tracers in a window make amplitudes unlike, or none at all in some, nobody can tell.
+
+    Parameters
+    ----------
+    amplitude : (nz, ny, nx) root of the mean square of the intensities in each window
+    sigma_voxel : (3,) standard deviation of a particle image along x, y, z; 0 where it is short
+    layout : the windows, in voxels
+    """
+    ratios = [np.zeros(0)]
+    for axis in np.flatnonzero(sigma_voxel == 0.0):
+        moved, apart = np.moveaxis(amplitude, 2 - axis, 0), -(-layout.size[axis] // layout.step[axis])
+        pairs = moved[:-apart], moved[apart:]
+        ratios.append((np.minimum(*pairs) / np.maximum(np.maximum(*pairs), np.finfo(np.float64).tiny)).ravel())
+    beside, found = np.concatenate(ratios), np.zeros(amplitude.shape, dtype=np.bool_)
+    alike = float(np.quantile(beside, TAIL_QUANTILE)) if len(beside) else 0.0
+    for axis in np.flatnonzero(sigma_voxel > 0.0):
+        windows = round(TAIL_SIGMAS * sigma_voxel[axis] / layout.step[axis])
+        largest = maximum_filter1d(amplitude, 2 * windows + 1, axis=2 - axis)
+        found |= amplitude < min(alike - TAIL_BELOW, LARGEST_TAIL) * largest
+    return found
 
 
 # Measurement noise that the test takes for granted, in voxels for particle images of 1 voxel standard deviation; it

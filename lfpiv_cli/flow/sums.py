@@ -88,12 +88,16 @@ class MapSums:
         maps = np.empty((nz, ny, nx, shifts**3))
         share_out(write_maps, nz * ny, blocks, energies, per_window, hop, SMALLEST_ENERGY**2 * brightest, maps)
         maps = maps.reshape(nz, ny, nx, shifts, shifts, shifts)
-        # The root of the sum of squares over each window where it stands, the mean of both volumes' in logs.
-        energy_a, energy_b = (e[:, shifts // 2, :, shifts // 2, :, shifts // 2] for e in energies)
-        amplitude = (energy_a.astype(np.float64) * energy_b).transpose(0, 2, 1) ** 0.25
+        amplitude = self.amplitude()
         # The other windows are what most of the light comes from.
         maps[amplitude < SMALLEST_AMPLITUDE * of_half_the_sum(amplitude)] = 0.0
         return maps
+
+    def amplitude(self) -> Floats:
+        """Return the root of the sum of squares over each window (nz, ny, nx), the mean of both volumes' in logs."""
+        middle = self.energies_a.shape[1] // 2
+        energy_a, energy_b = (e[:, middle, :, middle, :, middle] for e in (self.energies_a, self.energies_b))
+        return np.asarray((energy_a.astype(np.float64) * energy_b).transpose(0, 2, 1) ** 0.25)
 
 
 def map_sums(a: Singles, b: Singles, layout: WindowLayout, before: Triple, radius: int) -> MapSums:
