@@ -23,6 +23,7 @@ from lfpiv_cli.calibration.rectification import Rectification
 from lfpiv_cli.calibration.sheet import check_pitch, image_distance_mm, sheet_fit
 from lfpiv_cli.calibration.wave_shapes import WaveLight
 from lfpiv_cli.calibration.white import (
+    FULL_PERCENTILE,
     NARROWEST_LENS_IMAGE,
     by_aperture,
     fit_vignetting,
@@ -88,6 +89,7 @@ class Calibration:
     image_distance_mm, image_distance_sigma_mm : s_i by the pitch of the lens images, a check of the data sheet, or None
     ray_fit : polynomials of rays from boards at several depths, in the rectified frame, or None
     scene : where the faces before the fluid lie, from where the config has them, or None
+    white : (rows, columns) float32, raw uniform light over that of a full lens image, where the transmission is known
     """
 
     rectification: Rectification
@@ -101,6 +103,7 @@ class Calibration:
     ray_fit: RayFit | None = None
     mid_plane_given: bool = False
     scene: ScenePose | None = None
+    white: Singles | None = None
 
     @property
     def fit(self) -> LatticeFit:
@@ -287,11 +290,16 @@ def lattice_calibration(pictures: Photographs, shape: tuple[int, int], sheet: Da
         check_pitch(fit, sheet.pitch_px)
     check_residual(fit)
     rectification = Rectification(fit, shape)
-    image, lattice_px = rectification.apply(pictures.less_dark(whites[order[-1]])), rectification.lattice_px
-    narrow = lens_image_width(image, lattice_px) < NARROWEST_LENS_IMAGE
-    transmission = None if narrow else relative_transmission(image, lattice_px)
+    raw = pictures.less_dark(whites[order[-1]])
+    image, lattice_px = rectification.apply(raw), rectification.lattice_px
+    transmission, white = None, None
+    if lens_image_width(image, lattice_px) >= NARROWEST_LENS_IMAGE:
+        transmission = relative_transmission(image, lattice_px)
+        white = np.maximum(raw / np.percentile(raw, FULL_PERCENTILE), 0.0).astype(np.float32)
     distance, sigma = (None, None) if camera is None else image_distance_mm(fit, camera) or (None, None)
-    return Calibration(rectification, transmission, image_distance_mm=distance, image_distance_sigma_mm=sigma)
+    return Calibration(
+        rectification, transmission, image_distance_mm=distance, image_distance_sigma_mm=sigma, white=white
+    )
 
 
 def known(value: ArrayLike) -> Any:

@@ -1,8 +1,9 @@
 """The calibration file: all that `calibration.model.Calibration` holds, as HDF5.
 
 Layout, version 1: `image_shape` (rows, columns), `lattice` (centres and model of the lens images, pixels as (column,
-row)), `transmission` (rows, columns), `board` (pose, mm and degrees), `dlfc` (rays fitted to boards at several depths),
-`scene` (where the faces lie), and the channel's mid plane (mm). A weights file holds the same as a group.
+row)), `transmission` and `white` (rows, columns), `board` (pose, mm and degrees), `dlfc` (rays fitted to boards at
+several depths), `scene` (where the faces lie), and the channel's mid plane (mm). A weights file holds the same as a
+group.
 """
 
 from __future__ import annotations
@@ -28,7 +29,9 @@ from lfpiv_cli.optics.tracing import LARGEST_DEGREE, VARIABLES, PolynomialRays
 FORMAT = "lfpiv-calibration"
 VERSION = 1
 # Of the arrays whose names do not say them.
-UNITS = {"image_shape": "pixel", "transmission": "1", "indices": "1", "exponents": "1"}
+UNITS = {"image_shape": "pixel", "transmission": "1", "white": "1", "indices": "1", "exponents": "1"}
+# Of the whole sensor; None where they were not measured.
+PICTURES = ("transmission", "white")
 
 Shape = tuple[int | None, ...]
 
@@ -100,6 +103,7 @@ def tree_of(calibration: Calibration) -> dict[str, Any]:
         "image_shape": np.array(calibration.image_shape, dtype=np.int64),
         "lattice": fit | {"cubic_used": int(calibration.fit.cubic_used)},
         "transmission": calibration.transmission,
+        "white": calibration.white,
         **{name: None if part is None else asdict(part) for name, part in parts.items()},
         "mid_plane_given": 1 if calibration.mid_plane_given else None,
         **{name: getattr(calibration, name) for name in CARRIED},
@@ -116,11 +120,13 @@ def calibration_of(tree: Mapping[str, Any]) -> Calibration:
     try:
         rows, columns = (int(n) for n in tree["image_shape"])
         carried = _checked({name: tree.get(name) for name in CARRIED})
-        fit, passed = _checked(tree["lattice"]), tree.get("transmission")
-        if passed is not None:
-            _checked({"transmission": passed}, {"transmission": (rows, columns)})
-            if not np.isfinite(passed).all():
-                raise ValueError("a transmission is not a finite number")
+        fit, pictures = _checked(tree["lattice"]), [tree.get(name) for name in PICTURES]
+        for name, picture in zip(PICTURES, pictures, strict=True):
+            if picture is not None:
+                _checked({name: picture}, {name: (rows, columns)})
+                if not np.isfinite(picture).all():
+                    raise ValueError(f"a {name} is not a finite number")
+        passed, white = pictures
         lattice = Lattice(fit.pop("origin_px"), fit.pop("basis_px"), fit.pop("layout"))
         fit["cubic_used"] = bool(fit["cubic_used"])
         ray_fit, scene = None, None
@@ -145,6 +151,7 @@ def calibration_of(tree: Mapping[str, Any]) -> Calibration:
             ray_fit=ray_fit,
             mid_plane_given=bool(tree.get("mid_plane_given")),
             scene=scene,
+            white=white,
             **carried,
         )
     except (KeyError, TypeError, ValueError, AttributeError) as error:

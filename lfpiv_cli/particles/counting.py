@@ -10,8 +10,7 @@ Axes: raw images [row, column].
 
 from __future__ import annotations
 
-import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +23,7 @@ from lfpiv_cli.particles.fitting import add_all
 from lfpiv_cli.particles.noise import read_noise
 from lfpiv_cli.particles.search import Task
 from lfpiv_cli.particles.view import View
+from lfpiv_cli.reconstruction.haze import Lenses
 
 # Tracers for each microlens in the image that others are held against, and by how much their light differs: that of 0.6
 # to 1.4 of its mean. The light of real tracers often differs more, and they are then taken for fewer.
@@ -39,33 +39,6 @@ FEWEST_LENSES, LENSES_OF_KNOWN = 50, 4000
 # standard deviations of the read noise too little, which beside a faint tracer would be light that all share.
 BACKGROUND_PERCENTILE = 1.0
 BELOW_SIGMAS = float(-ndtri(0.01 * BACKGROUND_PERCENTILE))
-# The nearest microlenses of so many rows are sought at once: of all, it would take gigabytes.
-ROWS_AT_ONCE = 64
-
-
-class Lenses(NamedTuple):
-    """Which microlens each pixel of an image belongs to: its number (pixels,), of so many, rows times columns."""
-
-    number: NDArray[np.int64]
-    shape: tuple[int, int]
-
-    @classmethod
-    def of(cls, lattice_px: Lattice, image_shape: tuple[int, int]) -> Lenses:
-        """Return them for an image (rows, columns) on a lattice of lens images (column, row)."""
-        rows, columns = image_shape
-        indices = np.empty((rows, columns, 2), np.int64)
-        for first in range(0, rows, ROWS_AT_ONCE):
-            block = slice(first, min(first + ROWS_AT_ONCE, rows))
-            y, x = np.mgrid[block, 0:columns]
-            indices[block] = lattice_px.nearest(np.stack([x, y], axis=-1))
-        indices -= indices.min(axis=(0, 1))
-        ni, nj = (int(n) + 1 for n in indices.max(axis=(0, 1)))
-        return cls((indices[..., 1] * ni + indices[..., 0]).ravel(), (nj, ni))
-
-    def sums(self, values: NDArray[Any]) -> NDArray[np.float64]:
-        """Return the sum of pixels' values over each microlens (nj, ni)."""
-        total = np.bincount(self.number, values, math.prod(self.shape)).astype(np.float64)
-        return total.reshape(self.shape)
 
 
 class Seeded(NamedTuple):
@@ -94,7 +67,7 @@ def tracers_per_lens(task: Task, lattice_px: Lattice) -> float | None:
     shape = task.prepared.shape
     weights = task.weights
     seeded = Seeded(task.view, task.camera, weights.padded.grid, weights.grid, task.depths_mm)
-    return tracers_in_image(seeded, task.image.reshape(shape), task.usable.reshape(shape), lattice_px)
+    return tracers_in_image(seeded, task.light.reshape(shape), task.usable.reshape(shape), lattice_px)
 
 
 def tracers_in_image(

@@ -396,7 +396,7 @@ def _apart(task: Task, state: State, candidates: NDArray[np.float64]) -> NDArray
     # The light in squares of the image that hold theirs and what is around it.
     view, camera = task.view, task.view.camera
     size = np.array([camera.columns, camera.rows])
-    image = np.where(task.usable, task.image, 0.0).reshape(camera.rows, camera.columns)
+    image = np.where(task.usable, task.light, 0.0).reshape(camera.rows, camera.columns)
     sums = np.pad(image.cumsum(axis=0).cumsum(axis=1), ((1, 0), (1, 0)))
     reach = footprint_radius_mm(view, bright) + 2.0 * AROUND_LENSES * max(view.half_x_mm, view.half_y_mm)
     middle, reach = on_array_mm(view, bright) / camera.pixel_mm + 0.5 * size, reach[:, np.newaxis] / camera.pixel_mm
@@ -411,7 +411,7 @@ def _first_diameter(task: Task, state: State, apart: NDArray[np.float64]) -> tup
     """Return the one of the first sizes that candidates fitted alone agree on, and these as fitted, without noise."""
     # The image in place of a model that is not known yet; nothing has been taken off it.
     weight = state.noise.weights(task.image, np.zeros_like(task.image), 0.0)
-    weight, image = np.where(task.usable, weight, 0.0), task.image.copy()
+    weight, image = np.where(task.usable, weight, 0.0), task.light.copy()
     tracers = apart * (1.0, 1.0, 1.0, 0.0)
     starts = apart[:, 2:3] + np.array(START_DEPTHS) * task.view.scale.depth_mm
     fits = []

@@ -54,6 +54,12 @@ class Noise:
         variance = self.read_counts**2 + self.gain_counts * model + (self.model_error * model) ** 2
         return 1.0 / (variance + unexplained * np.maximum(residual, 0.0) ** 2)
 
+    def of_dark(self, haze: Floats | None) -> float:
+        """Return the standard deviation of pixels without a particle's light: the rms over haze (pixels,)."""
+        if haze is None or not haze.size:
+            return self.read_counts
+        return float(np.sqrt(np.mean(1.0 / self.weights(haze, np.zeros_like(haze), 0.0))))
+
 
 def pixel_weights(
     noise: Noise, image: Floats, residual: Floats, usable: NDArray[np.bool_], unexplained: float

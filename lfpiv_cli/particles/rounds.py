@@ -158,7 +158,7 @@ def with_candidates(task: Task, state: State, candidates: Floats, light: Floats)
     if typical == 0.0:
         # Where hardly any light meets the sensor, at the volume's rim, noise becomes peaks brighter than tracers.
         *_, seen = judge(observed(task, state, LAST_UNEXPLAINED), candidates)
-        noise = state.noise.read_counts * np.sqrt(lens_pixels(task.view))
+        noise = state.noise.of_dark(task.haze) * np.sqrt(lens_pixels(task.view))
         typical = first_typical_light(light[seen > SMALLEST_SEEN], noise)
     candidates = candidates[light > CANDIDATE_LIGHT * typical] if typical > 0.0 else candidates[:0]
     return replace(state, typical_light=typical, noise=noise_with(task, typical)), candidates

@@ -142,6 +142,7 @@ class Task:
     depths_mm : between which particles may lie
     photons_per_count : of the camera; None: not known
     light_covariance : (2, 2) of the squares of size and diffusion, see `diffusion`; None: both are right
+    haze : (rows * columns,) what of the image is smooth over the sensor and no tracer's; None: nothing
     """
 
     view: View
@@ -154,6 +155,12 @@ class Task:
     depths_mm: tuple[float, float]
     photons_per_count: float | None = None
     light_covariance: Floats | None = None
+    haze: Floats | None = None
+
+    @cached_property
+    def light(self) -> Floats:
+        """The tracers' light (rows * columns,): the image without haze."""
+        return self.image if self.haze is None else self.image - self.haze
 
     @cached_property
     def read_counts(self) -> float:
@@ -217,6 +224,7 @@ def task_of(
     excluded: NDArray[np.bool_] | None = None,
     photons_per_count: float | None = None,
     light_covariance: Floats | None = None,
+    haze: NDArray[np.float32] | None = None,
 ) -> Task:
     """Return the task that an image sets.
 
@@ -228,6 +236,7 @@ def task_of(
     excluded : (rows, columns) raw pixels that take no part; `sums` must leave out what they touch; None: none
     photons_per_count : of the camera; None: taken from how bright particles are, until the fit shows it
     light_covariance : see `Task`
+    haze : (rows, columns) in the image; None: nothing
     """
     low, high = weights.grid.bounds_mm(2)
     margin = MARGIN_DEPTHS * view.scale.depth_mm
@@ -242,13 +251,14 @@ def task_of(
         (low - margin, high + margin),
         photons_per_count,
         light_covariance,
+        None if haze is None else haze.astype(np.float64).ravel(),
     )
 
 
 def blank(task: Task) -> State:
     """Return the state in which nothing has been found."""
     nobody, none, noise = np.zeros((0, 4)), np.zeros((0, 5)), noise_with(task, 0.0)
-    return State(nobody, task.image.copy(), 0.0, noise, none, none, nobody, nothing_expected(0))
+    return State(nobody, task.light.copy(), 0.0, noise, none, none, nobody, nothing_expected(0))
 
 
 def noise_with(task: Task, typical_light: float) -> Noise:
@@ -316,7 +326,7 @@ def kept(task: Task, state: State, keep: NDArray[np.bool_]) -> State:
 
 def rebuilt(task: Task, state: State, particles: Floats) -> State:
     """Return the state with other particles, its residual computed from the image."""
-    residual = task.image.copy()
+    residual = task.light.copy()
     add_all(task.view, particles, -1.0, residual, task.depths_mm)
     return replace(state, particles=particles, residual=residual)
 
@@ -370,7 +380,7 @@ def result(task: Task, state: State) -> Particles:
     particles = state.particles[order]
     observation = observed(task, state, 0.0)
     chi2, _, seen = judge(observation, particles)
-    images = (task.image - state.residual, state.residual, observation.weight)
+    images = (task.light - state.residual, state.residual, observation.weight)
     model, left, trust = (values.reshape(shape) for values in images)
     correlation = error_correlation(model, left, trust, state.noise)
     changes = None
@@ -379,8 +389,9 @@ def result(task: Task, state: State) -> Particles:
     missing = missing_light(chi2[seen > LEAST_SEEN], chi2, lens_pixels(task.view))
     covariance = joint_covariance(observation, particles, correlation, missing, changes)
     # Where there is a model: elsewhere is the light of particles that were not found.
-    lit = task.usable & (task.image - state.residual > LIT_SIGMAS * state.noise.read_counts)
-    share = light_left(task.image[lit], state.residual[lit], state.noise.read_counts)
+    lit = task.usable & (task.light - state.residual > LIT_SIGMAS * state.noise.read_counts)
+    noise = state.noise.of_dark(None if task.haze is None else task.haze[lit])
+    share = light_left(task.light[lit], state.residual[lit], noise)
     covariance = grown(task.view, particles, covariance, share, correlation.share)
     covariance, ambiguous = with_other_places(observation, particles, covariance, chi2, correlation.share)
     to_world = task.camera.to_image_axes(np.eye(3))

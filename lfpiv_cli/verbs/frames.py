@@ -31,6 +31,7 @@ from lfpiv_cli.files.inputs import given
 from lfpiv_cli.files.provenance import seconds_between, sha256
 from lfpiv_cli.files.weights_file import WeightsFile
 from lfpiv_cli.notice import Notice, written
+from lfpiv_cli.reconstruction.haze import Haze, white_of
 from lfpiv_cli.reconstruction.images import (
     Image,
     Mask,
@@ -238,6 +239,9 @@ def other_frames(level: Background, frames: Sequence[Frame], mask: str | Path | 
 
 Progress = Callable[[int], None]
 
+# Where more middles of lens images than this share are as dark as between lens images, there is no haze: so many are of
+# one tracer for each microlens, and of haze of three times the noise.
+MOST_DARK = 0.1
 # The brightest of some millions of pixels stands 5.2 standard deviations out of normal noise.
 NOISE_SIGMAS = 6.0
 # The name of one in memory.
@@ -280,6 +284,21 @@ class Bench:
         if not too_bright.any():
             return self.excluded
         return self.excluded | touched(too_bright, self.content.weights.prepare)
+
+    def haze_in(self, lit: Image, unusable: Mask) -> Haze | None:
+        """Return the haze in a raw frame with dark or background taken off; None: none, or none that is certain.
+
+        Few tracers leave most lens images dark, which takes less time to see than haze.
+        """
+        calibration = self.content.weights.calibration
+        if calibration is None or calibration.white is None or not calibration.fit.lenses:
+            return None
+        level, noise = self.lens_images.background(np.where(unusable, np.float32(np.nan), lit))
+        column, row = np.clip(np.rint(calibration.fit.centres_px).astype(np.int64), 0, np.array(lit.shape[::-1]) - 1).T
+        if np.mean(np.abs(lit[row, column] - level) < noise) > MOST_DARK:
+            return None
+        white = white_of(calibration)
+        return None if white is None else white.haze_in(lit, ~unusable, (level, noise))
 
     def sums_without(self, operator: Operator, excluded: Mask) -> Normalisers:
         """Return an operator's sums without what a frame excludes: from those that all frames share, if they do."""
@@ -351,6 +370,19 @@ def frame_notices(bench: Bench, raw: Image, lit: Image, name: str) -> list[Notic
         *light_checks.level_notices(images, seen, name),
         *light_checks.position_notices(images, seen, name, MOVED_SINCE_CALIBRATION),
     ]
+
+
+def haze_notices(attributes: Mapping[str, Any], name: str) -> list[Notice]:
+    """Return what is said of the haze that was taken off a frame, by the attributes of what was made of it."""
+    if "haze_counts" not in attributes:
+        return []
+    level = float(attributes["haze_counts"])
+    text = (
+        f"{written(level)} counts in the middle of lens images, smooth over the sensor, are no tracer's light: this "
+        "haze is taken off, its noise stays"
+    )
+    remedy = "less scattered light: clean windows and fluid, a dark wall behind, a filter before fluorescent tracers"
+    return [Notice("haze", name, text, remedy, level, "none above the noise")]
 
 
 def _noise(seen: NDArray[np.float32]) -> float:

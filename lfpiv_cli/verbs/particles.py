@@ -33,6 +33,7 @@ from lfpiv_cli.particles.neighbour_frames import second_frame, second_pass
 from lfpiv_cli.particles.rounds import ROUNDS, first_pass
 from lfpiv_cli.particles.search import LAST_UNEXPLAINED, MUCH_LEFT, Particles, Task, result, task_of
 from lfpiv_cli.particles.view import Light, View, ensure_square_cells, raw_view
+from lfpiv_cli.reconstruction.haze import Haze
 from lfpiv_cli.reconstruction.images import Image, Mask, filled, light
 from lfpiv_cli.reconstruction.solvers import Normalisers
 from lfpiv_cli.verbs.frames import (
@@ -126,11 +127,18 @@ class Frame:
     image : (rows, columns) raw but for dark and background
     unusable : (rows, columns) pixels that take no part
     sums : of the padded weights without what these touch
+    haze : in the image; None: none
     """
 
     image: Image
     unusable: Mask
     sums: Normalisers
+    haze: Haze | None = None
+
+    @property
+    def light(self) -> Image:
+        """(rows, columns) the image without haze."""
+        return self.image if self.haze is None else self.image - self.haze.image
 
 
 def searchable(content: WeightsFile, settings: Config) -> WeightsFile:
@@ -161,7 +169,8 @@ def frame_of(bench: Bench, raw: Image, lit: Image) -> Frame:
     """Return a frame as particles are sought in it."""
     unusable = bench.unusable(raw)
     excluded = bench.excluded_with(unusable)
-    return Frame(filled(lit, unusable), unusable, bench.sums_without(bench.content.weights.padded, excluded))
+    sums = bench.sums_without(bench.content.weights.padded, excluded)
+    return Frame(filled(lit, unusable), unusable, sums, bench.haze_in(lit, unusable))
 
 
 class Sized(NamedTuple):
@@ -264,7 +273,15 @@ def task_for(bench: Bench, frame: Frame) -> Task:
     content, photons = bench.content, bench.settings.reconstruction.photons_per_count
     view = _view(bench, _light(content, bench.settings))
     return task_of(
-        frame.image, view, content.weights, content.camera, frame.sums, frame.unusable, photons, bench.light_covariance
+        frame.image,
+        view,
+        content.weights,
+        content.camera,
+        frame.sums,
+        frame.unusable,
+        photons,
+        bench.light_covariance,
+        None if frame.haze is None else frame.haze.image,
     )
 
 
@@ -302,8 +319,8 @@ def points_of(bench: Bench, frame: Frame, found: Particles, size: TracerSize, pr
     # How many microlenses the volume fills as the scene shows them.
     camera, (width, height, _) = content.camera, np.diff(bounds)[:, 0]
     lenses = float(width * height) * camera.magnification**2 / camera.lattice.cell_area
-    left = what_is_left(frame, found)
-    norm = float(np.linalg.norm(np.where(frame.unusable, 0.0, frame.image)))
+    left, haze = what_is_left(frame, found), frame.haze
+    norm = float(np.linalg.norm(np.where(frame.unusable, 0.0, frame.light)))
     share_left = float(np.linalg.norm(left)) / norm if norm > 0.0 else 0.0
     # Of four tracers for each microlens only 1.3 are found, and few of them are right.
     number = tracers_per_lens(bench, frame) if share_left > MUCH_LEFT else None
@@ -327,10 +344,13 @@ def points_of(bench: Bench, frame: Frame, found: Particles, size: TracerSize, pr
             "residual": share_left,
             "residual_rms_counts": float(np.sqrt(np.mean(left[~frame.unusable] ** 2))),
             "excluded_pixels": int(np.count_nonzero(frame.unusable)),
-            "read_noise_counts": found.noise.read_counts,
+            "read_noise_counts": found.noise.of_dark(
+                None if haze is None else haze.image[~frame.unusable].astype(np.float64)
+            ),
             "particles_per_lens": float(np.count_nonzero(inside)) / lenses,
             "depth_ambiguous": float(np.mean(found.ambiguous[inside])) if inside.any() else 0.0,
         }
+        | ({} if haze is None else {"haze_counts": haze.level_counts})
         | ({} if number is None else {"tracers_per_lens": number})
         | ({} if focus is None else {"microlens_focus": focus.off, "microlens_focus_sigma": focus.sigma})
         | size.attributes(),

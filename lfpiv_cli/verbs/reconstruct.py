@@ -43,6 +43,7 @@ from lfpiv_cli.verbs.frames import (
     check_frame,
     frame_notices,
     given_picture,
+    haze_notices,
     mask_of,
     other_frames,
     picture_for,
@@ -105,7 +106,9 @@ def reconstruct(
     lit = light(raw, bench.dark, given_picture(weights, background))
     check_frame(bench, raw, IMAGE)
     warn_of(frame_notices(bench, raw, lit, IMAGE))
-    return volume_of(bench, raw, lit, record("reconstruct", chosen.resolved(), {}))
+    volume = volume_of(bench, raw, lit, record("reconstruct", chosen.resolved(), {}))
+    warn_of(haze_notices(volume.attributes, IMAGE))
+    return volume
 
 
 def volume_of(
@@ -115,16 +118,22 @@ def volume_of(
     unusable = bench.unusable(raw)
     excluded = bench.excluded_with(unusable)
     content = bench.content
-    image, operator = content.weights.prepare(filled(lit, unusable)), content.weights.padded
+    haze, operator = bench.haze_in(lit, unusable), content.weights.padded
+    light_of_tracers = lit if haze is None else lit - haze.image
+    image = content.weights.prepare(filled(light_of_tracers, unusable))
     if bench.sums is None:
         operator = operator.for_image(as_if_lit(image, excluded))
     sums = bench.sums_without(operator, excluded)
     result = solve(operator, image, bench.settings.solver_settings(), sums=sums, progress=progress)
-    reported = content.reference.attributes() | {
-        "residual": result.residual,
-        "excluded_pixels": int(np.count_nonzero(excluded)),
-        "support_voxels": result.support_voxels,
-    }
+    reported = (
+        content.reference.attributes()
+        | {
+            "residual": result.residual,
+            "excluded_pixels": int(np.count_nonzero(excluded)),
+            "support_voxels": result.support_voxels,
+        }
+        | ({} if haze is None else {"haze_counts": haze.level_counts})
+    )
     grid = content.reference.grid_from_focal_point(content.weights.grid)
     array = content.weights.to_world(result.volume)
     return Volume(array, grid, content.reference, attributes=reported, provenance=dict(provenance))
@@ -336,6 +345,9 @@ class Reconstruction(Batch[Outcome]):
             made = with_warnings(made, notices)
             volume = volume_of(bench, *pictures, made, work.advance)
             array, grid, reference, reported = volume.array, volume.grid, volume.reference, volume.attributes
+            of_haze = haze_notices(reported, name)
+            work.console.warn(of_haze)
+            made = with_warnings(made, of_haze)
             vtkhdf.write_volume(
                 target.path, array, grid, reference, provenance=made, attributes=reported, overwrite=self._replace
             )

@@ -13,6 +13,7 @@ from lfpiv_cli.notice import Notice, written
 from lfpiv_cli.particles.diameter import LIMIT_SIGMAS
 from lfpiv_cli.particles.diffusion import USUAL_SIGMA_PX
 from lfpiv_cli.particles.search import MUCH_LEFT
+from lfpiv_cli.verbs.frames import haze_notices
 
 # More than this share of an image's light, its noise taken off, is too much to leave unexplained.
 LARGEST_UNEXPLAINED = 0.2
@@ -166,11 +167,11 @@ def _diameter_notices(settings: Config, size: TracerSize) -> list[Notice]:
 
 
 def light_notices(points: Points, name: str) -> list[Notice]:
-    """Return where none were found, where they crowd, or leave more of the image's light than noise makes."""
+    """Return where none were found, there is haze, they crowd, or leave more of the light than noise makes."""
     measured = points.attributes
     noise_share = measured["read_noise_counts"] / max(measured["residual_rms_counts"], measured["read_noise_counts"])
     unexplained = measured["residual"] * float(np.sqrt(1.0 - min(noise_share, 1.0) ** 2))
-    count, notices = len(points.position_mm), []
+    count, notices = len(points.position_mm), haze_notices(measured, name)
     if unexplained > LARGEST_UNEXPLAINED:
         notices.append(
             Notice(
@@ -245,7 +246,7 @@ def light_notices(points: Points, name: str) -> list[Notice]:
                 f"within {largest:g}",
             )
         )
-    if not count and not notices:
+    if not count and all(each.code == "haze" for each in notices):
         text = "no particles found: nothing stands out of the noise"
         notices.append(Notice("no-particles", name, text, "check exposure, --dark and --mask", 0.0, "some"))
     return notices

@@ -1,0 +1,221 @@
+"""Haze: light that is smooth over the sensor and lies on all lens images, as scattered light does, beside the tracers'.
+
+Behind a microlens haze has the profile of uniform light, and what of it no tracer outshines is the darkest of a lens
+image. Where haze alone is, pixels differ by its noise, each by its own; where tracers crowd, so that no pixel is
+without their light, the darkest differ by texture, which pixels side by side have in common. So one is known from the
+other, and light is taken for haze only where it is.
+
+Axes: raw images [row, column], counts; lenses [j, i].
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+from scipy.ndimage import distance_transform_edt
+
+from lfpiv_cli.arrays import Flags, Floats, Integers, Singles
+from lfpiv_cli.calibration.model import Calibration
+from lfpiv_cli.optics.camera import Lattice
+from lfpiv_cli.robust import HALF_NORMAL_MEDIAN
+
+# The nearest microlenses of so many rows are sought at once: of all, it would take gigabytes.
+ROWS_AT_ONCE = 64
+# Pixels that get this share of what their lens image's brightest ones do tell of haze: at rims the profile is less
+# certain. The brightest is the usual one of so many lenses along each side, whose resampling rings.
+PLATEAU, ALIKE_LENSES = 0.8, 5
+# A microlens tells that shows this share of the plateau's usual pixels.
+WHOLE = 0.5
+# The search begins with what this percentile of a microlens's pixels is, at this percentile of the microlenses in a
+# field of so many along each side: of one tracer for each microlens an eighth of the pixels is dark.
+DARK_PERCENTILE, BRIGHTER_PERCENTILE, DARK_LENS_PERCENTILE, FIELD_LENSES = 5.0, 25.0, 20.0, 9
+# It moves to the mean of the pixels within this many standard deviations, smoothed over this many microlenses
+# (standard deviation); after so many rounds it moves by less than a hundredth of one.
+CORE_SIGMAS, SMOOTH_LENSES, ROUNDS = 1.5, 2.0, 12
+# At first haze is known to this share, by how uneven it is over a field; from round to round the standard deviation
+# falls to this share of itself at most.
+UNEVENNESS, COOLING = 0.15, 0.7
+# Microlenses of which fewer pixels are dark do not tell; haze has at least so many standard deviations of its noise:
+# of 1.3 to 1.9 tracers for each microlens, without haze, few pixels are dark, and what they have is up to 1.3.
+LEAST_DARK, LEAST_SIGMAS = 0.05, 2.5
+# How far below it noise is looked at, and how far to either side texture.
+BELOW_SIGMAS, NEAR_SIGMAS = 4.0, 2.0
+# Share of the variance that pixels side by side have in common: of haze of 50 to 5,000 counts, with up to 0.65 tracers
+# of 2,000 counts for each microlens, up to 0.4, of 1,500 with one, 0.3; of two tracers and more without haze 0.96.
+LARGEST_TEXTURE = 0.4
+# Fewer pairs of pixels tell nothing.
+FEWEST_PAIRS = 1000
+# Keeps a mean over no pixels from being a division by zero.
+LEAST_PIXELS = 1e-6
+
+
+class Lenses(NamedTuple):
+    """Which microlens each pixel of an image belongs to: its number (pixels,), of so many, rows times columns.
+
+    The first one has the indices `first` (i, j) on the lattice.
+    """
+
+    number: NDArray[np.int64]
+    shape: tuple[int, int]
+    first: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, lattice_px: Lattice, image_shape: tuple[int, int]) -> Lenses:
+        """Return them for an image (rows, columns) on a lattice of lens images (column, row)."""
+        rows, columns = image_shape
+        indices = np.empty((rows, columns, 2), np.int64)
+        for first in range(0, rows, ROWS_AT_ONCE):
+            block = slice(first, min(first + ROWS_AT_ONCE, rows))
+            y, x = np.mgrid[block, 0:columns]
+            indices[block] = lattice_px.nearest(np.stack([x, y], axis=-1))
+        least = indices.min(axis=(0, 1))
+        indices -= least
+        ni, nj = (int(n) + 1 for n in indices.max(axis=(0, 1)))
+        return cls((indices[..., 1] * ni + indices[..., 0]).ravel(), (nj, ni), least)
+
+    def sums(self, values: NDArray[Any]) -> NDArray[np.float64]:
+        """Return the sum of pixels' values over each microlens (nj, ni)."""
+        return self.of_some(slice(None), values)
+
+    def of_some(self, pixels: NDArray[Any] | slice, values: NDArray[Any] | None = None) -> NDArray[np.float64]:
+        """Return the sum of some pixels' values over each microlens (nj, ni), or their number."""
+        total = np.bincount(self.number[pixels], values, math.prod(self.shape)).astype(np.float64)
+        return total.reshape(self.shape)
+
+
+@dataclass(frozen=True, eq=False)
+class Haze:
+    """Haze of an image.
+
+    Attributes
+    ----------
+    image : (rows, columns) its light, counts
+    level_counts : in the middle of lens images, the median over the sensor
+    """
+
+    image: Singles
+    level_counts: float
+
+
+@dataclass(frozen=True, eq=False)
+class White:
+    """Uniform light as the raw image shows it.
+
+    Attributes
+    ----------
+    light : (rows, columns) share of the light in the middle of the sensor
+    lenses : whose lens image a pixel is in
+    places : (2, pixels) where it lies among the lenses: (j, i) as fractions
+    plateau : (pixels,) in the middle of a lens image
+    """
+
+    light: Singles
+    lenses: Lenses
+    places: Singles
+    plateau: Flags
+
+    @classmethod
+    def of(cls, calibration: Calibration) -> White | None:
+        """Return the white image of a calibration; None where it has none."""
+        light, lattice_px = calibration.white, calibration.fit.lattice_px
+        if light is None:
+            return None
+        lenses = Lenses.of(lattice_px, (light.shape[0], light.shape[1]))
+        row, column = np.indices(light.shape)
+        places = lattice_px.coordinates(np.stack([column, row], axis=-1)).reshape(-1, 2) - lenses.first
+        brightest = np.zeros(math.prod(lenses.shape))
+        np.maximum.at(brightest, lenses.number, light.ravel())
+        usual = ndimage.median_filter(brightest.reshape(lenses.shape), ALIKE_LENSES).ravel()
+        plateau = (light.ravel() > PLATEAU * usual[lenses.number]) & (light.ravel() > 0.0)
+        return cls(light, lenses, np.ascontiguousarray(places.T[::-1], np.float32), plateau)
+
+    def haze_in(self, picture: Singles, usable: Flags, background: tuple[float, float]) -> Haze | None:
+        """Return the haze in a raw picture (rows, columns) less its dark image; None where there is none for certain.
+
+        Parameters
+        ----------
+        background : level and noise between the lens images, counts: haze is what is above
+        """
+        level, noise = background
+        pixels = np.flatnonzero(usable.ravel() & self.plateau)
+        places = self.places[:, pixels]
+        light = (picture.ravel()[pixels].astype(np.float64) - level) / self.light.ravel()[pixels]
+        found = self._darkest(pixels, light)
+        if found is None:
+            return None
+        haze, sigma = found[0], max(found[1], noise, UNEVENNESS * float(np.median(found[0])))
+        rest, whole = light - _between(haze, places), self._smoothed(pixels)
+        for _ in range(ROUNDS):
+            core = np.abs(rest) < CORE_SIGMAS * sigma
+            total, count = self._smoothed(pixels[core], rest[core]), self._smoothed(pixels[core])
+            haze = haze + total / np.maximum(count, LEAST_PIXELS)
+            # Where hardly a pixel is dark it is as in the nearest microlenses where some are.
+            hidden = count < LEAST_DARK * whole
+            if hidden.all():
+                return None
+            haze = haze[tuple(distance_transform_edt(hidden, return_distances=False, return_indices=True))]
+            rest = light - _between(haze, places)
+            below = rest[(rest < 0.0) & (rest > -BELOW_SIGMAS * sigma)]
+            least = float(np.median(-below)) / HALF_NORMAL_MEDIAN if below.size else 0.0
+            sigma = max(least, COOLING * sigma, 0.5 * noise)
+        middle = float(np.median(haze[self.lenses.of_some(pixels) > 0.0]))
+        if middle <= LEAST_SIGMAS * sigma:
+            return None
+        near = np.full(picture.shape, np.nan)
+        near.ravel()[pixels] = np.where(np.abs(rest) < NEAR_SIGMAS * sigma, rest, np.nan)
+        if _in_common(near) > LARGEST_TEXTURE:
+            return None
+        lit = np.maximum(_between(haze, self.places), 0.0).reshape(picture.shape) * self.light
+        return Haze(lit.astype(np.float32), middle)
+
+    def _smoothed(self, pixels: Integers, values: Floats | None = None) -> Floats:
+        """Return the sum of some pixels' values over microlenses (nj, ni), or their number, smoothed."""
+        return np.asarray(ndimage.gaussian_filter(self.lenses.of_some(pixels, values), SMOOTH_LENSES, mode="constant"))
+
+    def _darkest(self, pixels: Integers, light: Floats) -> tuple[Floats, float] | None:
+        """Return what dark pixels of the microlenses (nj, ni) have, and how far those differ that may be alike."""
+        if not pixels.size:
+            return None
+        number, count = self.lenses.number[pixels], self.lenses.of_some(pixels).ravel()
+        whole = count > WHOLE * np.median(count[count > 0.0])
+        # One sort of all, microlens by microlens.
+        lowest, span = float(light.min()), float(np.ptp(light)) + 1.0
+        ordered = np.sort(number * span + (light - lowest))
+        first = np.cumsum(count) - count
+        dark, brighter = (
+            ordered[(first + 0.01 * percentile * count).astype(np.int64)[whole]] - np.flatnonzero(whole) * span + lowest
+            for percentile in (DARK_PERCENTILE, BRIGHTER_PERCENTILE)
+        )
+        known, of_all = whole.reshape(self.lenses.shape), np.zeros(count.size)
+        of_all[whole] = dark
+        nearest = distance_transform_edt(~known, return_distances=False, return_indices=True)
+        of_all = of_all.reshape(self.lenses.shape)[tuple(nearest)]
+        haze = ndimage.percentile_filter(of_all, DARK_LENS_PERCENTILE, FIELD_LENSES, mode="nearest")
+        return haze, float(np.percentile(brighter - dark, DARK_LENS_PERCENTILE))
+
+
+@lru_cache(maxsize=1)
+def white_of(calibration: Calibration) -> White | None:
+    """Return `White.of` a calibration, which all its frames share."""
+    return White.of(calibration)
+
+
+def _between(of_lenses: Floats, places: NDArray[np.floating]) -> Floats:
+    """Return what pixels (n,) have at places (2, n) among lenses, of which (nj, ni) are known: linearly between."""
+    return np.asarray(ndimage.map_coordinates(of_lenses, places, order=1, mode="nearest"))
+
+
+def _in_common(rest: Floats) -> float:
+    """Return the share of the variance (rows, columns) that pixels side by side have in common; NaN does not count."""
+    pairs = [(rest[1:], rest[:-1]), (rest[:, 1:], rest[:, :-1])]
+    one, other = (np.concatenate([each[k].ravel() for each in pairs]) for k in (0, 1))
+    both = np.isfinite(one) & np.isfinite(other)
+    one, other = one[both], other[both]
+    squares = 0.5 * float(np.sum(one**2 + other**2))
+    return float(np.sum(one * other)) / squares if one.size >= FEWEST_PAIRS and squares > 0.0 else np.inf
