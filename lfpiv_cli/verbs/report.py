@@ -143,7 +143,7 @@ def report(
         count_pages(path)  # for its checks
     ensure_pages()
     ensure_drawing()
-    contents = contents_of(folder.parent, [folder]) if folder.is_file() else contents_of(folder)
+    contents = contents_of(folder.parent, [folder]) if os.path.isfile(folder) else contents_of(folder)
     fields = {path: open_vectors(path) for path in contents.of("vectors")[:MOST_FIELDS]}
     parts = judged(contents, fields)
     words = {part: checks.worst(lines, "good") for part, lines in parts.items()}
