@@ -7,11 +7,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
 
 from lfpiv_cli.arrays import Floats
 from lfpiv_cli.calibration.lattice import lattice_through
 from lfpiv_cli.calibration.lens_light import PARTS, Cells, LensImages, folded
-from lfpiv_cli.calibration.light_checks import dark_notices, level_notices, position_notices, uniform_notices
+from lfpiv_cli.calibration.light_checks import (
+    blur_notices,
+    dark_notices,
+    level_notices,
+    position_notices,
+    uniform_notices,
+)
 from lfpiv_cli.calibration.rectification import Rectification
 from lfpiv_cli.calibration.sheet import sheet_fit
 from lfpiv_cli.files.provenance import also_used_as
@@ -188,3 +195,13 @@ def test_a_picture_that_was_given_before_is_known() -> None:
     assert also_used_as(made("d"), "image") == "dark of reconstruct"
     # Images that a calibration was refined by show tracers.
     assert all(also_used_as(made(each), "image") is None for each in ("a", "a2", "new"))
+
+
+def test_blur_of_a_white_image_is_told(images: LensImages, lattice: Lattice, table2: Camera) -> None:
+    camera = replace(table2, columns=SHAPE[1], rows=SHAPE[0]).with_micro_images(lattice)
+    for blur_px, told in ((0.0, 0), (0.4, 0), (1.2, 1), (2.0, 1)):
+        notices = list(blur_notices(images, gaussian_filter(uniform(lattice), blur_px), camera))
+        assert [notice.code for notice in notices] == told * ["white-blurred"]
+        if notices:
+            # Less what diffraction and charge are allowed, which these discs have not.
+            assert blur_px - 0.4 < float(notices[0].measured) < blur_px + 0.1

@@ -19,6 +19,8 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
+from scipy.optimize import least_squares
+from scipy.special import ndtr
 
 from lfpiv_cli.arrays import Floats, Integers, Singles
 from lfpiv_cli.calibration.lattice import LatticeFit
@@ -181,6 +183,26 @@ class LensImages:
         following = float(system.amount.sum()) / total
         sigma = float(np.sqrt(np.sum((system.amount - following * level) ** 2))) / total
         return Beside(tuple(places), following, sigma, float(light.mean()) > TIMES_NOISE * NOISE_LIGHT * noise)
+
+    def rim_width_px(self, white: NDArray[np.floating]) -> float:
+        """Return how wide the rims of the lens images of a white image (rows, columns) less its dark one are.
+
+        The standard deviation of the Gaussian that blurs discs: sharp ones have that of pixels and bins.
+        """
+        bins, pitch = self.pattern.shape[-1], float(self.lattice_px.pitch.mean())
+        seen = _over(folded(white, 0.0, self.cells, bins).sum(axis=0), self.area.sum(axis=0)).ravel()
+        place, steps = cell_places(bins), range(-2, 4)
+        distance = np.stack(
+            [np.linalg.norm((place - (i, j)) @ self.lattice_px.basis, axis=-1) for i in steps for j in steps]
+        )
+
+        def rest(unknowns: Floats) -> Floats:
+            radius, width = unknowns
+            discs = np.sum(ndtr((radius - distance) / width), axis=0).ravel()
+            return np.asarray(seen - discs * (discs @ seen) / max(float(discs @ discs), TINY))
+
+        bounds = (0.2 * pitch, 0.1), (0.7 * pitch, 0.5 * pitch)
+        return float(least_squares(rest, (0.47 * pitch, 0.1 + 0.05 * pitch), bounds=bounds).x[1])
 
     def background(self, picture: NDArray[np.floating]) -> tuple[float, float]:
         """Return level and noise of a picture's background: what darker pixels between lens images vary about."""

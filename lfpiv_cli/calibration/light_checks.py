@@ -24,6 +24,7 @@ from lfpiv_cli.calibration.white import MIDDLE_PER_PITCH, NARROWEST_LENS_IMAGE
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.notice import Notice, written
 from lfpiv_cli.optics.camera import Camera, Lattice
+from lfpiv_cli.optics.line_responses import USUAL_DIFFUSION_PX
 from lfpiv_cli.robust import MAD_TO_SIGMA
 
 # What is not a thin lens before a parallel array: an aperture that is cut aslant, a tilted array, a curved field.
@@ -238,6 +239,33 @@ def white_notices(white: Floats, fit: LatticeFit, width: float, sheet_width: flo
         yield Notice("aperture-not-as-told", "camera.main_lens.aperture_mm", text, remedy, width, expected)
 
 
+def blur_notices(images: LensImages, white: NDArray[np.floating], camera: Camera) -> Iterator[Notice]:
+    """Yield what is said where the rims of the lens images of a white image less its dark one are blurred.
+
+    Pixels, bins, diffusion, what one lens diffracts and its focus blur them in any case.
+    """
+    array_mm, distance_mm = float(camera.lattice.pitch.mean()), camera.microlens_distance_mm
+    bin_px = float(images.lattice_px.pitch.mean()) / images.pattern.shape[-1]
+    defocus = abs(1.0 - distance_mm / camera.microlens_focal_length_mm + distance_mm / camera.image_distance_mm)
+    blurs_px = (
+        np.sqrt(1.0 / 12.0),
+        bin_px / np.sqrt(6.0),
+        USUAL_DIFFUSION_PX,
+        DIFFRACTED * GREEN_MM * distance_mm / array_mm / camera.pixel_mm,
+        defocus * array_mm / camera.pixel_mm / np.sqrt(12.0),
+    )
+    found, expected = images.rim_width_px(white), float(np.linalg.norm(blurs_px))
+    if found > np.hypot(expected, LARGEST_BLUR_PX):
+        more = float(np.sqrt(found**2 - expected**2))
+        text = (
+            f"the rims of its lens images are {written(found, 2)} px wide (standard deviation), {written(expected, 2)} "
+            f"by the data sheet: it is blurred by {written(more, 2)} px, at most {LARGEST_BLUR_PX:g} of a good one; "
+            "frames beside it seem to have moved"
+        )
+        remedy = "take it with the camera still, focused as for the frames, and the diffuser evenly lit"
+        yield Notice("white-blurred", WHITE, text, remedy, more, f"at most {LARGEST_BLUR_PX:g} px")
+
+
 def neighbours_difference(white: Floats, fit: LatticeFit) -> float:
     """Return how much nine in ten lens images at most differ in brightness from the median of those around."""
     half = max(1, int(MIDDLE_PER_PITCH * fit.lattice_px.pitch.mean()))
@@ -252,6 +280,9 @@ def neighbours_difference(white: Floats, fit: LatticeFit) -> float:
 
 # Lens images that have moved by less do no harm: a share of the pitch, and what pixels themselves make of small ones.
 LARGEST_SHIFT_SHARE, LARGEST_SHIFT_PX = 0.008, 0.15
+# Rims of white images of drawn rigs are as wide as is expected; those that are blurred by this, as standard deviation,
+# are not. Of a lens that diffracts, the share of wavelength times f-number that its blur is.
+LARGEST_BLUR_PX, DIFFRACTED, GREEN_MM = 0.6, 0.45, 5.5e-4
 # In so many standard errors, of as many places and pictures as people have.
 CERTAIN_SIGMAS = 5.0
 # Of a picture's light at least so much follows the lens images: haze, tracers and boards do wholly, hot pixels do not.

@@ -159,6 +159,8 @@ def light_notices(rig: Config, pictures: Photographs, found: Calibration) -> lis
     notices = (
         [] if pictures.dark is None else light_checks.dark_notices(images, np.asarray(pictures.dark, dtype=np.float64))
     )
+    if found.white is not None and camera is not None:
+        notices += light_checks.blur_notices(images, found.white, camera)
     if found.transmission is not None:
         notices += light_checks.shape_notices(light_checks.shapes_of(images, found.rectification.image_shape))
     for number, board in enumerate(boards, 1):
