@@ -25,7 +25,7 @@ from tests.commands import told as told_of
 
 PAIR = SAMPLE / "pair_a.tif", SAMPLE / "pair_b.tif"
 PHOTOGRAPHS = [word for name in ("white", "dark", "board") for word in (f"--{name}", SAMPLE / f"{name}.tif")]
-RIGHT = "0.57 tracers for each microlens, and particles err less up to about 2"
+RIGHT = "0.55 tracers for each microlens, and particles err less up to about 2"
 FILES = ("calibration.h5", "calibration.png", "weights.h5", "volumes/pair_a.vtkhdf", "volumes/pair_b.vtkhdf")
 VECTORS = "vectors.vtkhdf"
 
