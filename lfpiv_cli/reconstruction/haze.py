@@ -44,6 +44,8 @@ UNEVENNESS, COOLING = 0.15, 0.7
 # Microlenses of which fewer pixels are dark do not tell; haze has at least so many standard deviations of its noise:
 # of 1.3 to 1.9 tracers for each microlens, without haze, few pixels are dark, and what they have is up to 1.3.
 LEAST_DARK, LEAST_SIGMAS = 0.05, 2.5
+# Fewer counts are what rounding and a dark level that drifts leave.
+LEAST_COUNTS = 2.0
 # How far below it noise is looked at, and how far to either side texture.
 BELOW_SIGMAS, NEAR_SIGMAS = 4.0, 2.0
 # Share of the variance that pixels side by side have in common: of haze of 50 to 5,000 counts, with up to 0.65 tracers
@@ -165,7 +167,7 @@ class White:
             least = float(np.median(-below)) / HALF_NORMAL_MEDIAN if below.size else 0.0
             sigma = max(least, COOLING * sigma, 0.5 * noise)
         middle = float(np.median(haze[self.lenses.of_some(pixels) > 0.0]))
-        if middle <= LEAST_SIGMAS * sigma:
+        if middle <= max(LEAST_SIGMAS * sigma, LEAST_COUNTS):
             return None
         near = np.full(picture.shape, np.nan)
         near.ravel()[pixels] = np.where(np.abs(rest) < NEAR_SIGMAS * sigma, rest, np.nan)
