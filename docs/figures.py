@@ -183,7 +183,7 @@ def links(path: Path) -> None:
     rng, flow = np.random.default_rng(14), rigid_rotation((0.0, 0.0, 0.15 / DT_S))
     first = rng.uniform((-2.0, -2.0, -0.6), (2.0, 2.0, 0.6), (260, 3))
     second = np.concatenate([advect(flow, first, DT_S)[26:], rng.uniform((-2.0, -2.0, -0.6), (2.0, 2.0, 0.6), (26, 3))])
-    linked = track(Seen(first), Seen(second), 0.4, RIG.camera_model().scale(MEDIA))
+    linked = track(Seen(first), Seen(second), RIG.camera_model().scale(MEDIA), 0.4)
     figure, axes = new_panels(4.6, 4.4)
     for start in first:
         for end in second[np.abs(second - start).max(axis=1) < 0.4]:
