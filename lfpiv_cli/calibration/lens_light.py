@@ -13,6 +13,7 @@ Axes: (column, row) in pixels; parts row by row.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -133,10 +134,8 @@ class LensImages:
         bins = int(np.clip(np.rint(lattice.pitch.mean()), FEWEST_BINS, MOST_BINS))
         if transmission is None:
             # A pixel's rim is soft.
-            place, rim = cell_places(bins), 0.5 * lens_image_width * float(lattice.pitch.mean()) + 0.5
-            steps = range(-2, 4)
-            distances = (np.linalg.norm((place - (i, j)) @ lattice.basis, axis=-1) for i in steps for j in steps)
-            discs = np.asarray(sum(np.clip(rim - distance, 0.0, 1.0) for distance in distances))
+            rim = 0.5 * lens_image_width * float(lattice.pitch.mean()) + 0.5
+            discs = np.asarray(sum(np.clip(rim - distance, 0.0, 1.0) for distance in _distances(bins, lattice)))
             pattern = np.repeat(discs[np.newaxis], PARTS**2, axis=0)
         else:
             upright, inside = Cells.of(rectification.lattice_px, shape), rectification.inside
@@ -191,10 +190,7 @@ class LensImages:
         """
         bins, pitch = self.pattern.shape[-1], float(self.lattice_px.pitch.mean())
         seen = _over(folded(white, 0.0, self.cells, bins).sum(axis=0), self.area.sum(axis=0)).ravel()
-        place, steps = cell_places(bins), range(-2, 4)
-        distance = np.stack(
-            [np.linalg.norm((place - (i, j)) @ self.lattice_px.basis, axis=-1) for i in steps for j in steps]
-        )
+        distance = np.stack(list(_distances(bins, self.lattice_px)))
 
         def rest(unknowns: Floats) -> Floats:
             radius, width = unknowns
@@ -233,6 +229,12 @@ class LensImages:
             system = System(matrix, (weight * (np.swapaxes(design, 1, 2) @ rest))[..., 0], amount)
             unknowns = unknowns + np.linalg.inv(matrix.sum(axis=0)) @ system.pull.sum(axis=0)
         return system, unknowns
+
+
+def _distances(bins: int, lattice_px: Lattice) -> Iterator[Floats]:
+    """Yield how far the bins of a cell (bins, bins) are from each of the lens images around, px."""
+    place, steps = cell_places(bins), range(-2, 4)
+    return (np.linalg.norm((place - (i, j)) @ lattice_px.basis, axis=-1) for i in steps for j in steps)
 
 
 def dark_level(pixels: NDArray[np.floating]) -> tuple[float, float]:

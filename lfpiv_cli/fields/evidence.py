@@ -20,7 +20,7 @@ from scipy.linalg import cho_factor, cho_solve
 from lfpiv_cli.arrays import Floats
 from lfpiv_cli.fields import stencils
 from lfpiv_cli.fields.stencils import DIVERGENCE, ORDERS, SMOOTHNESS, Expectation, Lattice, bound, inverse_of, penalty
-from lfpiv_cli.fields.structure import Samples, belonging, error_covariance, without_itself
+from lfpiv_cli.fields.structure import Samples, belonging, error_covariance, inverse_covariances, without_itself
 from lfpiv_cli.threads import in_threads
 
 # Cells of a box along each axis: some thousand unknowns.
@@ -213,7 +213,7 @@ def _told(
     """
     box, belief = of_box
     covariance = error_covariance(box.samples, expected.scale, expected.unresolved_mm)
-    weight = belief[:, np.newaxis, np.newaxis] * np.linalg.inv(covariance)
+    weight = inverse_covariances(covariance, belief)
     matrix, right = box.normal(weight)
     inverse, factor = _inverse(matrix + before)
     coefficients, by_data = cho_solve(factor, right), before_inverse - inverse

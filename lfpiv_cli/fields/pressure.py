@@ -25,7 +25,7 @@ from lfpiv_cli.fields import stencils
 from lfpiv_cli.fields.evidence import Box, first_expectation, most_probable
 from lfpiv_cli.fields.fit import Field
 from lfpiv_cli.fields.spline_field import LAST_CHANGE, POINTS_AT_ONCE, ROUNDS, SplineField, gradient_covariance_at
-from lfpiv_cli.fields.structure import Samples, belonging, error_covariance, squares
+from lfpiv_cli.fields.structure import Samples, belonging, error_covariance, inverse_covariances, squares
 from lfpiv_cli.robust import MAD_TO_SIGMA
 
 # Gradients of a scalar as samples: what each spline has of them, and their part of the normal equations.
@@ -284,7 +284,7 @@ def _fitted(
     matrix = stencils.expected_inverse(
         lattice, replace(expected, spread_mm=lattice.smallest_mm * expected.spread_mm), 1
     )
-    weight = probability[:, np.newaxis, np.newaxis] * np.linalg.inv(covariance)
+    weight = inverse_covariances(covariance, probability)
     add_gradients(matrix, lattice, samples.points_mm, weight)
     factor = stencils.factorised(matrix)
     found = _coefficients(factor, lattice, samples.points_mm, weight, samples.value_mm)

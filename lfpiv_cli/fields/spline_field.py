@@ -14,7 +14,7 @@ import numpy as np
 from lfpiv_cli.arrays import Floats
 from lfpiv_cli.fields import stencils
 from lfpiv_cli.fields.evidence import FREE_DIVERGENCE, divergence_weight, first_expectation, most_probable
-from lfpiv_cli.fields.structure import Samples, belonging, error_covariance, squares, with_places
+from lfpiv_cli.fields.structure import Samples, belonging, error_covariance, inverse_covariances, squares, with_places
 
 # Knots are so many times the samples' mean distance apart: a third as many knots as samples. Among factors of 1.2 to
 # 1.8, less adds noise where samples are few, and more holds divergence and values of small vortices further off.
@@ -171,7 +171,7 @@ def spline_field(
         float(np.sum(probability * chi2) / (3.0 * np.sum(probability))),
         np.zeros_like(coefficients),
     )
-    return _with_put_back(field, factor, about, _weights(covariance, probability), error)
+    return _with_put_back(field, factor, about, inverse_covariances(covariance, probability), error)
 
 
 def _with_put_back(
@@ -198,11 +198,6 @@ def _with_put_back(
     return replace(field, coefficients=field.coefficients + taken, put_back=taken)
 
 
-def _weights(covariance: Floats, probability: Floats) -> Floats:
-    """Return the weights (n, 3, 3) of samples."""
-    return np.asarray(probability[:, np.newaxis, np.newaxis] * np.linalg.inv(covariance))
-
-
 def _right_hand_side(samples: Samples, lattice: stencils.Lattice, weight: Floats, value_mm: Floats) -> Floats:
     """Return the normal equations' right-hand side (nx, 3, ny, nz) of values (n, 3) at the samples' points."""
     return stencils.right_hand_side(lattice, samples.points_mm, np.einsum("nij,nj->ni", weight, value_mm))
@@ -212,7 +207,7 @@ def _solved(
     samples: Samples, lattice: stencils.Lattice, before: stencils.Stencil, covariance: Floats, probability: Floats
 ) -> tuple[stencils.Factor, Floats]:
     """Return the factor of the normal equations and the coefficients (nx, 3, ny, nz)."""
-    weight = _weights(covariance, probability)
+    weight = inverse_covariances(covariance, probability)
     matrix = before.copy()
     stencils.add_samples(matrix, lattice, samples.points_mm, weight)
     right = _right_hand_side(samples, lattice, weight, samples.value_mm)

@@ -96,6 +96,11 @@ def error_covariance(samples: Samples, scale: float, unresolved_mm: float) -> Fl
     return np.asarray(scale**2 * samples.covariance_mm2 + unresolved_mm**2 * np.eye(samples.value_mm.shape[1]))
 
 
+def inverse_covariances(covariance: Floats, probability: Floats) -> Floats:
+    """Return the weights (n, 3, 3) of samples that belong to a field with a probability (n,)."""
+    return np.asarray(probability[:, np.newaxis, np.newaxis] * np.linalg.inv(covariance))
+
+
 def squares(error_mm: Floats, covariance: Floats) -> Floats:
     """Return the squared Mahalanobis distances (n,) of errors (n, 3) by their covariances (n, 3, 3)."""
     return np.asarray(np.einsum("ni,nij,nj->n", error_mm, np.linalg.inv(covariance), error_mm))
