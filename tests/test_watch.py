@@ -209,7 +209,7 @@ def test_an_interrupted_watch_keeps_what_is_done_and_goes_on(rig: Path, tmp_path
             time.sleep(0.2)
         process.send_signal(signal.SIGINT)
         # That a signal is answered within seconds is tested of all commands; here others may keep the processor busy.
-        assert process.wait(timeout=60.0) == 130
+        assert process.wait(timeout=20.0) == 130
     finally:
         process.kill()
         process.communicate()
