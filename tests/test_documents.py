@@ -351,7 +351,7 @@ def test_versions_of_formats_are_those_that_are_written_and_read() -> None:
 
 
 # What HDF5 itself keeps beside dimension scales, and the datasets of VTK's cells, are named once for all.
-GENERIC = {"CLASS", "NAME", "REFERENCE_LIST", "DIMENSION_LIST", "units"}
+GENERIC = {"CLASS", "NAME", "REFERENCE_LIST", "DIMENSION_LIST", "units", "Attribute"}
 
 
 def members_of(path: Path) -> Iterator[str]:

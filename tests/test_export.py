@@ -136,6 +136,7 @@ def test_vtk_plays_vectors(planes: int, tmp_path: Path, rng: np.random.Generator
         assert reader.GetTimeValue() == 0.5 * step
         image, content = reader.GetOutput(), read_content(path)
         assert (image.GetDimensions(), image.GetOrigin()) == ((4, 3, planes), grid.origin_mm)
+        assert image.GetPointData().GetVectors().GetName() == "velocity"
         for name, array in content.arrays.items():
             same(vtk_to_numpy(image.GetPointData().GetArray(name)).reshape(array.shape), array)
     with h5py.File(tmp_path / "series.vtkhdf") as file:

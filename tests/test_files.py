@@ -274,6 +274,8 @@ def test_paraviews_reader_opens_the_very_files(tmp_path: Path, rng: np.random.Ge
         assert image.GetOrigin() == pytest.approx(grid.origin_mm)
         assert image.GetSpacing() == pytest.approx(grid.spacing_mm)
         data = image.GetPointData()
+        active = data.GetVectors() or data.GetScalars()
+        assert active.GetName() == {"v.vtkhdf": "intensity", "w.vtkhdf": "velocity"}[name.name]
         names = [data.GetArrayName(k) for k in range(data.GetNumberOfArrays())]
         found |= {name: vtk_to_numpy(data.GetArray(name)) for name in names}
     np.testing.assert_array_equal(found["intensity"], array.astype(np.float32).ravel())

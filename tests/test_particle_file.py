@@ -56,6 +56,8 @@ def test_what_is_written_is_read_and_vtk_opens_the_very_file(path: Path) -> None
     reader.SetFileName(str(path))
     reader.Update()
     data = reader.GetOutput()
+    assert data.GetPointData().GetScalars().GetName() == "intensity"
+    assert data.GetPointData().GetVectors() is None
     assert data.GetNumberOfPoints() == data.GetNumberOfVerts() == 5
     np.testing.assert_array_equal(vtk_to_numpy(data.GetPoints().GetData()), np.arange(15.0).reshape(5, 3))
     intensity = vtk_to_numpy(data.GetPointData().GetArray("intensity"))
@@ -101,6 +103,7 @@ def test_vtk_plays_the_places_of_each_frame(tracks: Points, tmp_path: Path) -> N
         assert shown.GetNumberOfPoints() == shown.GetNumberOfVerts() == here.sum()
         if here.any():
             np.testing.assert_array_equal(vtk_to_numpy(shown.GetPoints().GetData()), tracks.position_mm[here])
+            assert shown.GetPointData().GetVectors().GetName() == "velocity"
             for name in ("track", "velocity"):
                 np.testing.assert_array_equal(
                     vtk_to_numpy(shown.GetPointData().GetArray(name)), tracks.arrays[name][here]

@@ -33,7 +33,7 @@ from lfpiv_cli.files.hdf5 import (
     write_rows,
 )
 from lfpiv_cli.files.inputs import reason
-from lfpiv_cli.files.vtkhdf import create_vtk_group, read_root, write_root
+from lfpiv_cli.files.vtkhdf import create_vtk_group, mark_active, read_root, write_root
 from lfpiv_cli.grid import Reference
 
 # The places of a sequence's tracks on a disk: put there a frame at a time, read by frame or by track.
@@ -285,7 +285,7 @@ def write_points(path: Path, format_name: str, points: PointRows, *, overwrite: 
             write_rows(group, "Connectivity", ids, _counted(ids))
         data = vtk.create_group("PointData")
         for name, unit in units.items():
-            data[name] = write_rows(file, name, points.count, points.rows(name), unit)
+            data[name] = mark_active(write_rows(file, name, points.count, points.rows(name), unit), name)
 
 
 def units_of(format_name: str, names: Container[str]) -> dict[str, str]:

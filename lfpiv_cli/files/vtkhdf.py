@@ -37,6 +37,8 @@ from lfpiv_cli.grid import Grid, Reference
 
 # The version of VTK's layout that ParaView 5.12 reads and later ones still do.
 VTK_VERSION = (2, 0)
+# Arrays that VTK's filters take where none is asked for, as what.
+ACTIVE = {"velocity": "Vectors", "intensity": "Scalars"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,6 +63,13 @@ def create_vtk_group(file: h5py.File, grid: Grid | None) -> h5py.Group:
         vtk.attrs["Spacing"] = np.array(grid.spacing_mm, dtype=np.float64)
         vtk.attrs["Direction"] = np.eye(3).ravel()
     return vtk
+
+
+def mark_active(dataset: h5py.Dataset, name: str) -> h5py.Dataset:
+    """Return a point array, marked where it is one that VTK's filters take when none is asked for."""
+    if name in ACTIVE:
+        dataset.attrs["Attribute"] = np.bytes_(ACTIVE[name])
+    return dataset
 
 
 def write_steps(
@@ -296,8 +305,6 @@ def _write_on_grid(file: h5py.File, grid: Grid, arrays: Mapping[str, tuple[NDArr
     if "velocity" in arrays:
         write_array(file, "component", np.arange(3), "1").make_scale("component")
     points = create_vtk_group(file, grid).create_group("PointData")
-    if "velocity" in arrays:
-        points.attrs["Vectors"] = np.bytes_("velocity")
     for name, (array, unit) in arrays.items():
         axes = ["z", "y", "x"] + ["component"] * (array.ndim - 3)
         if array.shape[0] == 1:
@@ -305,7 +312,7 @@ def _write_on_grid(file: h5py.File, grid: Grid, arrays: Mapping[str, tuple[NDArr
         dataset = write_array(file, name, array, unit)
         for position, axis_name in enumerate(axes):
             dataset.dims[position].attach_scale(file[axis_name])
-        points[name] = dataset
+        points[name] = mark_active(dataset, name)
 
 
 def grid_in(file: h5py.File) -> Grid:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from lfpiv_cli.files.hdf5 import FILTERS, created, write_array, write_rows
 from lfpiv_cli.files.particle_file import CELLS, POSITION, TRAJECTORIES_FORMAT, UNITS, PointRows, Points, lines_of
-from lfpiv_cli.files.vtkhdf import create_vtk_group, write_root, write_steps
+from lfpiv_cli.files.vtkhdf import create_vtk_group, mark_active, write_root, write_steps
 from lfpiv_cli.grid import Reference
 
 if TYPE_CHECKING:
@@ -156,7 +156,7 @@ def write_playback(path: Path, tracks: PointRows, frames: int, dt_s: float, *, o
             write_rows(group, "Connectivity", ids, (np.arange(each) for each in cells))
         data = vtk.create_group("PointData")
         for name in SHOWN:
-            write_rows(data, name, count, rows(name), units[name])
+            mark_active(write_rows(data, name, count, rows(name), units[name]), name)
         steps = write_steps(vtk, (dt_s * np.arange(frames)).tolist(), "s", dict.fromkeys(SHOWN, before))
         write_array(steps, "PartOffsets", np.arange(frames, dtype=np.int64))
         write_array(steps, "NumberOfParts", np.ones(frames, np.int64))
@@ -206,13 +206,11 @@ def write_series(
         write_root(file, SERIES_FORMAT, SERIES_VERSION, reference, reported, provenance)
         vtk = create_vtk_group(file, grid)
         points = vtk.create_group("PointData")
-        if "velocity" in first.arrays:
-            points.attrs["Vectors"] = np.bytes_("velocity")
         for name, array in first.arrays.items():
             shape = array.shape[array.shape[0] == 1 :]
             options = {"chunks": (1, *shape)[of_one:], "track_times": False, **FILTERS}
             dataset = points.create_dataset(name, (count, *shape)[of_one:], array.dtype, **options)
-            dataset.attrs["units"] = np.bytes_(first.units[name])
+            mark_active(dataset, name).attrs["units"] = np.bytes_(first.units[name])
         if not of_one:
             write_steps(vtk, times, unit, dict.fromkeys(first.arrays, np.arange(count, dtype=np.int64)))
         for number in range(count):
