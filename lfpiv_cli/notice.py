@@ -61,6 +61,14 @@ def written(value: float, digits: int = 3) -> str:
     return text.rstrip("0").rstrip(".") if "." in text else text
 
 
+def with_error(value: float, error: float) -> str:
+    """Return a number and its standard error, both to the second digit of that: 0.1200 ± 0.0055."""
+    if not (math.isfinite(error) and error > 0.0):
+        return f"{written(value)} ± {written(error)}"
+    decimals = max(1 - math.floor(math.log10(float(f"{error:.1e}"))), 0)
+    return f"{value:z.{decimals}f} ± {error:.{decimals}f}"
+
+
 class LfpivWarning(UserWarning):
     """What speaks against a result; `notice` has its code, what it is about, figure, expectation and remedy."""
 

@@ -26,7 +26,7 @@ from lfpiv_cli.files.pages import Page, Picture, Section, Table, write_pages, wr
 from lfpiv_cli.files.pairing import Pairs
 from lfpiv_cli.files.vtkhdf import open_vectors
 from lfpiv_cli.flow.field import VALID, VectorField
-from lfpiv_cli.notice import written
+from lfpiv_cli.notice import with_error, written
 from lfpiv_cli.pictures.vectors import planes_figure
 from lfpiv_cli.verbs import checks, particles
 from lfpiv_cli.verbs.batches import Failure
@@ -227,7 +227,7 @@ class Latest:
         cells = (
             UNKNOWN if tracers_per_lens is None else written(tracers_per_lens, 2),
             str(np.count_nonzero(flow.flag == VALID)),
-            *(f"{each:.4f} ± {written(error, 2)}" for each, error in zip(mean, sigma, strict=True)),
+            *map(with_error, mean.tolist(), sigma.tolist()),
             verdict,
             f"{seconds:.1f}",
         )
