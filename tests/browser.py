@@ -31,14 +31,14 @@ ARGUMENTS = (
 class Browser:
     """A page of a browser; `requests` are the addresses that it has asked for."""
 
-    def __init__(self, profile: Path) -> None:
+    def __init__(self, profile: Path, *more: str) -> None:
         assert CHROMIUM
         to_browser, self._write = os.pipe()
         self._read, from_browser = os.pipe()
         # Chromium reads descriptor 3 and writes descriptor 4.
         script = f'exec 3<&{to_browser} 4>&{from_browser}; exec "$@"'
         self._process = subprocess.Popen(
-            ["bash", "-c", script, "bash", CHROMIUM, *ARGUMENTS, f"--user-data-dir={profile}", "about:blank"],
+            ["bash", "-c", script, "bash", CHROMIUM, *ARGUMENTS, *more, f"--user-data-dir={profile}", "about:blank"],
             pass_fds=(to_browser, from_browser),
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
@@ -110,8 +110,8 @@ class Browser:
 
 
 @contextmanager
-def opened(page: Path, profile: Path) -> Iterator[Browser]:
-    """Open a page in a browser of its own."""
-    with Browser(profile) as browser:
+def opened(page: Path, profile: Path, *more: str) -> Iterator[Browser]:
+    """Open a page in a browser of its own, with `more` arguments."""
+    with Browser(profile, *more) as browser:
         browser.open(page)
         yield browser

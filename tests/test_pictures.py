@@ -102,6 +102,16 @@ def test_particles_and_what_they_leave() -> None:
     np.testing.assert_array_equal(side.collections[0].get_offsets(), position[:2, [0, 2]])
 
 
+@pytest.mark.parametrize("shape", [(448, 600), (600, 448), (100, 600)])
+def test_labels_of_an_image_lie_within_its_picture(shape: tuple[int, int]) -> None:
+    figure = of_points.residual_figure(np.random.default_rng(0).normal(0.0, 100.0, shape))
+    figure.draw_without_rendering()
+    left, bottom, right, top = figure.axes[0].get_tightbbox().extents
+    assert min(left, bottom) >= 0.0
+    assert right <= figure.bbox.width
+    assert top <= figure.bbox.height
+
+
 def test_space_shows_tracks_by_their_speed_some_of_many_and_none() -> None:
     position = np.arange(15.0).reshape(5, 3)
     lines = of_points.trajectory_lines(position, np.array([0, 0, 4, 4, 4]))

@@ -27,8 +27,9 @@ from lfpiv_cli.files.particle_file import (
 )
 from lfpiv_cli.files.provenance import sha256
 from lfpiv_cli.files.vtkhdf import open_vectors, write_vectors, write_volume
+from lfpiv_cli.flow.windows import ParallelWalls
 from lfpiv_cli.grid import Grid, Reference
-from lfpiv_cli.pictures.points import MOST_LINES, lines_view
+from lfpiv_cli.pictures.points import MOST_LINES, Lines, lines_view, wall_dots
 from lfpiv_cli.verbs import checks
 from lfpiv_cli.verbs import report as stage
 from lfpiv_cli.verbs.plot import figures_of
@@ -118,11 +119,35 @@ def test_a_page_is_made_once_and_shows_some_of_many_lines(results: Path, tmp_pat
     with pytest.raises(UsageError, match=r"ends in \.html"):
         report(results, tmp_path / "page.pdf", console=QUIET)
     pytest.importorskip("plotly")
-    lines = [np.array([[k, 0.0, 0.0], [k, 1.0, 0.0]]) for k in range(3 * MOST_LINES)]
-    values = [np.full(2, 0.1) for _ in lines]
-    few, many = lines_view(lines[:MOST_LINES], values[:MOST_LINES], "m/s"), lines_view(lines, values, "m/s")
+    few, many = (lines_view(parallel_lines(count), with_script=False) for count in (MOST_LINES, 3 * MOST_LINES))
     assert len(many) == pytest.approx(len(few), rel=0.01)
-    assert lines_view([], [], "m/s")
+    assert lines_view(parallel_lines(0))
+
+
+def parallel_lines(count: int) -> Lines:
+    places = [np.array([[k, 0.0, 0.0], [k, 1.0, 0.0]]) for k in range(count)]
+    return Lines(places, [np.full(2, 0.1 * k) for k in range(count)], np.ones(count))
+
+
+def test_a_view_has_faint_lines_where_errors_are_large_walls_and_one_script() -> None:
+    pytest.importorskip("plotly")
+    lines, walls = parallel_lines(5), ParallelWalls(4.0)
+    faint = replace(lines, sigma_m_s=np.array([1.0, 1.0, 1.0, 1.0, 9.0]))
+    plain, seen = (lines_view(each, with_script=False) for each in (lines, faint))
+    empty = '"x":[],"y":[]'
+    assert empty in plain
+    assert empty not in seen
+    # from the least speed to the largest but for a percent at each end
+    assert '"cmin":0.0' in plain
+    assert '"cmax":0.4' in plain
+    with_walls = lines_view(lines, walls, name="second", with_script=False)
+    assert len(with_walls) > len(plain)
+    assert 'id="second"' in with_walls
+    dots = wall_dots(lines.places_mm, walls)
+    assert set(dots[:, 2]) == {-2.0, 2.0}
+    np.testing.assert_array_equal((dots.min(axis=0)[:2], dots.max(axis=0)[:2]), ([0.0, 0.0], [4.0, 1.0]))
+    assert "<script src" not in plain
+    assert len(lines_view(lines)) > len(plain) + 1_000_000
 
 
 def test_pictures_are_drawn_on_the_raw_image_that_a_file_was_made_from(
@@ -264,7 +289,8 @@ def test_many_pairs_stand_in_their_order_and_settings_have_no_empty_ones(
     sections = {section.title: section for section in pages[0].sections}
     table = sections["Vectors"].tables[0]
     assert [row[0] for row in table.rows] == ["p1.vtkhdf", "p9.vtkhdf", "p10.vtkhdf"]
-    assert [row[3].split(",")[0] for row in table.rows] == ["0.1", "0.9", "1"]
+    assert table.head[3] == "mean u ± usual σ of one (m/s)"
+    assert [row[3] for row in table.rows] == ["0.1000 ± 0.0050", "0.90000 ± 0.00056", "1.00000 ± 0.00050"]
     # the series, and planes, profiles and errors of the mean
     assert len(sections["Vectors"].pictures) == summary["pictures"] == 4
     assert list(sections["Settings"].commands) == ["camera: {pitch_mm: 0.125}", "windows: [null, 8]"]
@@ -285,6 +311,10 @@ def test_a_browser_sees_the_page_and_loads_nothing(results: Path, tmp_path: Path
         asked = [address for address in browser.requests if not address.startswith(("data:", "blob:"))]
     assert len(widths) == summary["pictures"]
     assert min(widths) > 400
+    shown = "[...document.querySelectorAll('.view, figure.paper')].map(each => each.offsetHeight > 0)"
+    for more, seen in (((), [True, True, False]), (("--disable-3d-apis",), [False, False, True])):
+        with opened(page, tmp_path / f"profile{len(more)}", *more) as browser:
+            assert browser.evaluate(shown) == seen, more
     assert asked == [page.resolve().as_uri()]
     assert (tmp_path / "page.pdf").read_bytes().startswith(b"%PDF")
 

@@ -327,6 +327,14 @@ class Config:
         section = self._needed(mask, getattr(self.sections, mask))
         return section.wall() if isinstance(section, PipeSection) else ParallelWalls(section.width_mm)
 
+    def walls(self) -> Walls | None:
+        """Return the walls about the fluid in the volume's coordinates, None where the config does not place them."""
+        if self.pipe is not None:
+            return self.pipe.wall()
+        if self.channel is None or self.volume.reference != "mid_plane":
+            return None
+        return ParallelWalls(self.channel.width_mm)
+
     def still_walls(self) -> Walls | None:
         """Return the walls at which the fluid stands still, the pipe's or the channel's, None where neither is said."""
         if self.pipe is not None and self.pipe.no_slip:

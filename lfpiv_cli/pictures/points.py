@@ -7,12 +7,14 @@ inside, as it is an optional extra and slow to load; its JavaScript, 4.5 MB, goe
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
 
 from lfpiv_cli.arrays import Floats, Integers
+from lfpiv_cli.flow.windows import Walls
 from lfpiv_cli.notice import written
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.curved_space import CurvedSpace
@@ -26,8 +28,8 @@ LARGEST_CHI2 = 5.0
 CHI2_BARS = 50
 # The area of all dots on an image, and the smallest and largest of one, in square points: many must not hide it.
 DOTS_AREA, DOT_SIZES = 15_000.0, (6.0, 26.0)
-# Width of pictures with an image, in inches.
-IMAGE_WIDTH = 10.0
+# Width of pictures with an image, in inches, and the image's share of it beside labels and the bar of colours.
+IMAGE_WIDTH, IMAGE_SHARE = 10.0, 0.75
 
 
 def places_px(focal_point_mm: Floats, camera: Camera, media: Media, scene: CurvedSpace | None) -> Floats:
@@ -96,7 +98,7 @@ def residual_figure(residual: Floats) -> style.Figure:
 def _image_canvas(image: Floats) -> tuple[style.Figure, Any]:
     """Return a figure of an image's shape, and its axes, which are the image's pixels."""
     rows, columns = image.shape
-    figure, axes = style.new_panels(IMAGE_WIDTH, min(max(0.8 * IMAGE_WIDTH * rows / columns + 0.8, 3.0), 12.0))
+    figure, axes = style.new_panels(IMAGE_WIDTH, min(max(IMAGE_SHARE * IMAGE_WIDTH * rows / columns + 0.8, 3.0), 12.0))
     axes.set(xlabel="column (px)", ylabel="row (px)")
     return figure, axes
 
@@ -243,6 +245,17 @@ def lengths_figure(track: Integers) -> style.Figure:
 # More lines make a page slow to turn.
 MOST_LINES = 4000
 HEIGHT_PX = 640
+# Lines whose stated error is so many times the usual one are faint.
+FAINT_SIGMAS, FAINT = 3.0, 0.2
+# The colours of speeds reach so far (%), and few odd ones do not stretch them.
+SPEED_PERCENT = (1.0, 99.0)
+# Of walls: their dots along the longest side, and how far beyond the lines, in that side, they are looked for in depth.
+WALL_DOTS, WALL_REACH = 40, 1.0
+# Of a box, as a share of its longest side, for how far away it is seen from.
+LEAST_SIDE = 0.1
+# From where it is seen, as the still picture: depth to the right, y up. A box that is longer than a cube of its
+# volume is seen from so much farther.
+EYE, LOOKED_AT = np.array([-1.2, 0.9, 0.85]), {"x": 0, "y": -0.15, "z": 0}
 
 
 def has_views() -> bool:
@@ -250,38 +263,91 @@ def has_views() -> bool:
     return find_spec("plotly") is not None
 
 
-def lines_view(lines: Sequence[Floats], values: Sequence[Floats], label: str) -> str:
-    """Return a view of lines, a dot at the end of each.
+def wall_dots(lines: Sequence[Floats], walls: Walls) -> Floats:
+    """Return dots (k, 3), mm, on the walls beside lines."""
+    points = np.concatenate([np.zeros((0, 3)), *lines])
+    if not len(points):
+        return points
+    low, high = points.min(axis=0), points.max(axis=0)
+    longest = float((high - low).max())
+    reach = np.array([0.0, 0.0, WALL_REACH * longest])
+    return walls.points(low - reach, high + reach, np.full(3, longest / WALL_DOTS))
+
+
+@dataclass(frozen=True, eq=False)
+class Lines:
+    """Lines in space.
+
+    Attributes
+    ----------
+    places_mm : (k, 3) of each
+    speed_m_s : (k,) at each place of each
+    sigma_m_s : (n,) stated error of each; NaN where none is stated
+    """
+
+    places_mm: Sequence[Floats]
+    speed_m_s: Sequence[Floats]
+    sigma_m_s: Floats
+
+
+def lines_view(lines: Lines, walls: Walls | None = None, *, name: str = "view", with_script: bool = True) -> str:
+    """Return a view of lines coloured by speed, a dot at the end of each, faint ones those of large stated errors.
 
     Parameters
     ----------
-    lines : places (k, 3) of each; of more than `MOST_LINES`, some from all over the list are shown
-    values : (k,) what each place is coloured by
-    label : of the colours, with their unit
+    lines : of more than `MOST_LINES`, some from all over the list are shown
+    walls : of the fluid, drawn as dots
+    name : unlike that of others on the page, of which the first has the script
     """
     from plotly.graph_objects import Figure, Scatter3d
 
-    shown = np.linspace(0, len(lines) - 1, min(MOST_LINES, len(lines))).astype(int).tolist()
+    count = len(lines.places_mm)
+    shown = np.linspace(0, count - 1, min(MOST_LINES, count)).astype(int)
+    sigma = lines.sigma_m_s[shown]
+    known = sigma[np.isfinite(sigma)]
+    is_faint = sigma > FAINT_SIGMAS * (float(np.median(known)) if known.size else 0.0)
+    speeds = np.concatenate([np.zeros(0), *(lines.speed_m_s[k] for k in shown)])
+    speeds = speeds[np.isfinite(speeds)]
+    low, high = np.percentile(speeds, SPEED_PERCENT) if speeds.size else (0.0, 1.0)
+    colours = {"colorscale": "Viridis", "cmin": float(low), "cmax": float(high) if high > low else float(low) + 1.0}
+    bar = {"title": {"text": "speed (m/s)", "side": "right"}, "len": 0.8, "thickness": 16}
+    figure = Figure()
     gap, nothing = np.full((1, 3), np.nan), np.full(1, np.nan)
-    path = np.concatenate([np.zeros((0, 3)), *(part for k in shown for part in (lines[k], gap))]).astype(np.float32)
-    value = np.concatenate([np.zeros(0), *(part for k in shown for part in (values[k], nothing))])
-    ends = np.array([lines[k][-1] for k in shown], dtype=np.float32).reshape(-1, 3)
-    last = np.array([values[k][-1] for k in shown])
-    known = value[np.isfinite(value)]
-    low, high = float(known.min(initial=0.0)), float(known.max(initial=np.finfo(np.float32).tiny))
-    colours = {"colorscale": "Viridis", "cmin": low, "cmax": high}
-    # A line has no colour between two places where one is NaN: there the next one's is not seen.
-    along = {**colours, "color": np.nan_to_num(value), "width": 3}
-    dots = {**colours, "color": last, "size": 2, "colorbar": {"title": label}}
-    figure = Figure(
-        [
-            Scatter3d(x=path[:, 0], y=path[:, 1], z=path[:, 2], mode="lines", line=along, hoverinfo="skip"),
-            Scatter3d(x=ends[:, 0], y=ends[:, 1], z=ends[:, 2], mode="markers", marker=dots, customdata=last).update(
-                hovertemplate="x %{x:.2f}, y %{y:.2f}, z %{z:.2f} mm<br>%{customdata:.4g}<extra></extra>"
-            ),
-        ]
-    )
+    for some, opacity in ((shown[~is_faint], 1.0), (shown[is_faint], FAINT)):
+        path = np.concatenate([np.zeros((0, 3)), *(part for k in some for part in (lines.places_mm[k], gap))])
+        value = np.concatenate([np.zeros(0), *(part for k in some for part in (lines.speed_m_s[k], nothing))])
+        ends = np.array([lines.places_mm[k][-1] for k in some]).reshape(-1, 3)
+        last = np.array([lines.speed_m_s[k][-1] for k in some])
+        # A line has no colour between two places where one is NaN: there the next one's is not seen.
+        along = {**colours, "color": np.nan_to_num(value), "width": 3}
+        dots = {**colours, "color": last, "size": 2} | ({"colorbar": bar} if opacity == 1.0 else {})
+        said = "x %{x:.2f}, y %{y:.2f}, z %{z:.2f} mm<br>%{customdata:.4g} m/s<extra></extra>"
+        figure.add_traces(
+            [
+                Scatter3d(_along_axes(path), mode="lines", line=along, hoverinfo="skip", opacity=opacity),
+                Scatter3d(_along_axes(ends), mode="markers", marker=dots, customdata=last, opacity=opacity).update(
+                    hovertemplate=said
+                ),
+            ]
+        )
+    on_walls = np.zeros((0, 3))
+    if walls is not None:
+        dots = {"color": "grey", "size": 1.5}
+        on_walls = wall_dots(lines.places_mm, walls)
+        figure.add_trace(Scatter3d(_along_axes(on_walls), mode="markers", marker=dots, hoverinfo="skip"))
+    sides = np.ptp(np.concatenate([*lines.places_mm, on_walls, np.zeros((1, 3))]), axis=0)
+    farther = sides.max() / np.prod(np.maximum(sides, LEAST_SIDE * sides.max())) ** (1.0 / 3.0) if sides.any() else 1.0
     axes = {f"{axis}axis": {"title": f"{axis} (mm)"} for axis in "xyz"}
-    scene, margin = {**axes, "aspectmode": "data"}, {"l": 0, "r": 0, "t": 0, "b": 0}
+    scene = {
+        **axes,
+        "aspectmode": "data",
+        "camera": {"up": {"x": 0, "y": 1, "z": 0}, "eye": _along_axes(farther * EYE)},
+    }
+    margin = {"l": 0, "r": 0, "t": 30, "b": 0}
     figure.update_layout(scene=scene, height=HEIGHT_PX, showlegend=False, margin=margin)
-    return str(figure.to_html(full_html=False, include_plotlyjs=True, div_id="view", config={"displaylogo": False}))
+    how: dict[str, Any] = {"full_html": False, "include_plotlyjs": with_script, "div_id": name}
+    return str(figure.to_html(**how, config={"displaylogo": False}))
+
+
+def _along_axes(points: Floats) -> dict[str, Any]:
+    return dict(zip("xyz", points.astype(np.float32).T, strict=True))

@@ -399,7 +399,7 @@ def of_vectors(field: VectorField, name: str) -> list[Line]:
     if not there.any():
         return [Line("vectors", "no", f"{name}: no vector is left")]
     share = np.count_nonzero(there) / np.count_nonzero(used)
-    reasons = [Line("vectors", "good", f"{name}: {np.count_nonzero(there)} vectors, {share:.0%} of the places")]
+    reasons = [Line("vectors", "good", f"{name}: {np.count_nonzero(there)} vectors, {share:.0%} of the grid points")]
     if field.uncertainty_voxel is not None:
         long = np.abs(field.displacement_voxel[there]) > SHORTEST_SIGMAS * field.uncertainty_voxel[there]
         if np.mean(long.any(axis=1)) < 0.5:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -14,11 +15,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import yaml
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.console import CONSOLE, Console, readable
-from lfpiv_cli.errors import InputError, UsageError
+from lfpiv_cli.errors import ConfigError, InputError, UsageError
 from lfpiv_cli.files import calibration_file, weights_file
 from lfpiv_cli.files.atomic import ensure_writable
 from lfpiv_cli.files.calibration_file import open_calibration
+from lfpiv_cli.files.config import carried_config
 from lfpiv_cli.files.hdf5 import open_h5, read_provenance
 from lfpiv_cli.files.images import count_pages
 from lfpiv_cli.files.listing import natural
@@ -42,10 +45,11 @@ from lfpiv_cli.files.particle_file import (
 )
 from lfpiv_cli.files.provenance import sha256
 from lfpiv_cli.files.vtkhdf import VECTORS_FORMAT, VOLUME_FORMAT, open_vectors, read_extra, read_header
-from lfpiv_cli.flow.field import MASKED, REJECTED, VALID, VectorField
+from lfpiv_cli.flow.field import MASKED, MM_TO_M, REJECTED, VALID, VectorField
 from lfpiv_cli.flow.statistics import PAIRS
-from lfpiv_cli.notice import written
-from lfpiv_cli.pictures.points import MOST_LINES, has_views, lines_view, trajectory_lines
+from lfpiv_cli.flow.windows import Walls
+from lfpiv_cli.notice import with_error, written
+from lfpiv_cli.pictures.points import MOST_LINES, Lines, displacement_lines, has_views, lines_view, trajectory_lines
 from lfpiv_cli.pictures.style import caption_of
 from lfpiv_cli.pictures.vectors import planes_figure, profiles_figure, series_figure, sigma_figure, speed_unit
 from lfpiv_cli.verbs import checks
@@ -80,6 +84,7 @@ OF_VECTORS, OF_OTHERS = ("planes", "profiles", "sigma"), ("planes",)
 OF_PARTICLES, OF_VOLUMES = ("image", "residual", "depths"), ("projections",)
 OF_STATISTICS = ("moments", "stresses", "profile", "convergence")
 OF_TRACKS, OF_WEIGHTS = ("space", "sigma"), ("light",)
+FAINT_WORDS = "those of large stated errors faint, walls dotted"
 # A cell of a figure that is not known.
 UNKNOWN = "–"
 # Vectors by their files.
@@ -367,7 +372,7 @@ def _of_all_vectors(contents: Contents, fields: Fields) -> list[checks.Line]:
 
 def _chain(contents: Contents, fields: Fields, drawer: Drawer) -> Iterable[Section]:
     """Yield the sections of vectors, tracks, images and calibration, as far as they are there."""
-    groups, pictures = _by_command(contents, fields), list[Picture]()
+    groups, pictures, views = _by_command(contents, fields), list[Picture](), Views()
     if fields:
         paths = [path for group in groups.values() for path in group]
         count = len(contents.of("vectors"))
@@ -377,14 +382,18 @@ def _chain(contents: Contents, fields: Fields, drawer: Drawer) -> Iterable[Secti
                 pictures += drawer.of_batch({path.stem: fields[path] for path in group})
             else:
                 pictures += drawer.pictures(group[0], only=OF_OTHERS if number else OF_VECTORS)
-        yield Section("Vectors", "vectors", text, tables=(table,), pictures=tuple(pictures))
+        best = paths[0]
+        view = "" if fields[best].dt_s is None else views.of(_of_field(fields[best]), contents.record(best))
+        text += (f"The view can be turned; it shows vectors of {best.name}.",) if view else ()
+        yield Section("Vectors", "vectors", text, tables=(table,), pictures=tuple(pictures), view=view)
     for path in [path for path in fields if "pairs" in read_header(path).attributes][:1]:
         pictures = drawer.pictures(path, only=OF_STATISTICS)
         yield Section("Statistics", "statistics", tables=tuple(_statistics(path)), pictures=tuple(pictures))
     for path in contents.of("tracks")[:1]:
         points = open_tracks(path)
-        view = _view(points) if has_views() and len(points.position_mm) else ""
-        text = (f"The view can be turned; it shows at most {MOST_LINES} tracks of {path.name}.",) if view else ()
+        view = views.of(_of_points(points), contents.record(path))
+        text = (f"The view can be turned; it shows at most {MOST_LINES:,} tracks of {path.name}, {FAINT_WORDS}.",)
+        text = text if view else ()
         pictures = drawer.pictures(path, only=OF_TRACKS)
         # On a screen the view shows what the first one does.
         pictures = [replace(each, on_paper=bool(view) and not number) for number, each in enumerate(pictures)]
@@ -416,7 +425,8 @@ def _with_sigmas(calibration: Path) -> tuple[tuple[str, str], ...]:
         base = name.removesuffix("_sigma")
         if base == name or base not in summary:
             sigma = summary.get(f"{name}_sigma")
-            rows.append((name, _cell(value) if sigma is None else f"{_cell(value)} ± {readable(sigma, digits=2)}"))
+            each = zip(np.atleast_1d(value), np.atleast_1d(sigma), strict=True) if sigma is not None else ()
+            rows.append((name, ", ".join(with_error(*one) for one in each) or _cell(value)))
     return tuple(rows)
 
 
@@ -446,7 +456,7 @@ def _statistics(path: Path) -> Iterable[Table]:
         for end in ("", "_sigma")
     )
     rows = (
-        (written(at), *(f"{written(x)} ± {written(error, 2)}" for x, error in zip(*each, strict=True)), str(samples))
+        (written(at), *map(with_error, *each), str(samples))
         for at, *each, samples in zip(line["at_mm"], value, sigma, line["samples"], strict=True)
     )
     yield Table("Profile, without noise", (f"{said['profile']} (mm)", *heads, "samples"), tuple(rows))
@@ -477,7 +487,7 @@ def _particle_row(path: Path) -> Row:
     sigma = np.sqrt(points.arrays["covariance_mm2"][inside, :3])
     reported = points.attributes
     return {
-        "particles": str(np.count_nonzero(inside)),
+        "particles": f"{np.count_nonzero(inside)}, and {np.count_nonzero(~inside)} beside the volume",
         "per microlens": _cell(reported.get("particles_per_lens")),
         "light not explained": _cell(reported.get("residual")),
         "median sigma x, y, z (mm)": _cell(np.median(sigma, axis=0).tolist()) if inside.any() else UNKNOWN,
@@ -489,7 +499,7 @@ def _particle_row(path: Path) -> Row:
 def _with_error(reported: Mapping[str, Any], name: str, unit: str) -> str:
     """Return what a file tells of a number, with its standard error where it has one."""
     value, error = reported.get(f"{name}_{unit}"), reported.get(f"{name}_sigma_{unit}")
-    return _cell(value) if value is None or error is None else f"{written(value)} ± {written(error, 2)}"
+    return _cell(value) if value is None or error is None else with_error(value, error)
 
 
 def _field_row(vectors: VectorField) -> Row:
@@ -498,22 +508,59 @@ def _field_row(vectors: VectorField) -> Row:
     return {
         "vectors": str(quality.used),
         "valid": f"{np.mean(vectors.flag[used] == VALID):.1%}" if used.any() else UNKNOWN,
-        "mean u, v, w (m/s)": _cell(mean.tolist()) if np.isfinite(mean).all() else UNKNOWN,
-        "usual σ of one (m/s)": readable(sigma.tolist(), digits=2) if np.isfinite(sigma).all() else UNKNOWN,
-        "median moved (voxel)": _cell(np.median(moved, axis=0).tolist()) if len(moved) else UNKNOWN,
+        **{
+            f"mean {name} ± usual σ of one (m/s)": with_error(each, error) if math.isfinite(each) else UNKNOWN
+            for name, each, error in zip("uvw", mean.tolist(), sigma.tolist(), strict=True)
+        },
+        "median moved (voxel)": readable(np.median(moved, axis=0).tolist(), 3) if len(moved) else UNKNOWN,
     }
 
 
-def _view(points: Points) -> str:
-    """Return the view of tracks, coloured by speed; by displacement where no time is known."""
-    speed = np.linalg.norm(points.arrays["velocity"], axis=1)
-    if points.arrays.keys() >= {"track"}:
+def _of_points(points: Points) -> Lines:
+    """Return tracks as lines; of a pair those from one place to the other, which a link's place is half-way of."""
+    speed, sigma = (np.linalg.norm(points.arrays[name], axis=1) for name in ("velocity", "velocity_sigma"))
+    if "track" in points.arrays:
         track = points.arrays["track"]
-        return lines_view(trajectory_lines(points.position_mm, track), trajectory_lines(speed, track), "speed (m/s)")
-    # A link's place is half-way.
+        places, speeds, sigmas = (trajectory_lines(each, track) for each in (points.position_mm, speed, sigma))
+        return Lines(places, speeds, np.array([np.median(each) for each in sigmas]))
     half = 0.5 * points.arrays["displacement_mm"]
-    lines = list(np.stack([points.position_mm - half, points.position_mm + half], axis=1))
-    return lines_view(lines, [np.full(2, each) for each in speed], "speed (m/s)")
+    return Lines(list(np.stack([points.position_mm - half, points.position_mm + half], axis=1)), _twice(speed), sigma)
+
+
+def _of_field(field: VectorField) -> Lines:
+    """Return vectors as lines about their grid points, as long as their distances allow."""
+    there, scale = field.flag < REJECTED, np.asarray(field.voxel_mm)
+    moved = field.displacement_voxel[there] * scale
+    lines, _ = displacement_lines(field.grid.centres_mm()[there], moved)
+    sigma = np.full(moved.shape, np.nan) if field.uncertainty_voxel is None else field.uncertainty_voxel[there] * scale
+    rate = 1.0 if field.dt_s is None else MM_TO_M / field.dt_s
+    return Lines(lines, _twice(rate * np.linalg.norm(moved, axis=1)), rate * np.linalg.norm(sigma, axis=1))
+
+
+@dataclass
+class Views:
+    """The views of a page, of which the first brings what turns them."""
+
+    count: int = 0
+
+    def of(self, lines: Lines, made: Mapping[str, Any]) -> str:
+        """Return the view of lines and of the walls that the record of their file tells of; "" where there is none."""
+        if not (has_views() and lines.places_mm):
+            return ""
+        self.count += 1
+        return lines_view(lines, _walls(made), name=f"view{self.count}", with_script=self.count == 1)
+
+
+def _twice(values: Floats) -> list[Floats]:
+    return list(np.stack([values, values], axis=1))
+
+
+def _walls(made: Mapping[str, Any]) -> Walls | None:
+    """Return the walls that the config of a record tells of, if it is there and of this version."""
+    try:
+        return carried_config(made, "").walls()
+    except (InputError, ConfigError):
+        return None
 
 
 def _records(contents: Contents) -> Iterable[Section]:
