@@ -169,7 +169,7 @@ def test_the_verdict_of_a_pair_knows_of_its_vectors_by_both_methods(
     watching.Latest(tmp_path, Console(), draws=False).measured("p1_a", 0.5, paths, paths[1], 2.0)
     assert verdicts == ["good"]
     # 1 mm in 1 ms; of 0.05, 0.02 and 0.4 voxel of 0.1, 0.2 and 0.3 mm
-    words = "0.5 per microlens  990 vectors  u 1.0000 ± 0.005  v 0.0000 ± 0.004  w 0.0000 ± 0.12 m/s  look  2.0 s"
+    words = "0.5 per microlens  990 vectors  u 1.0000 ± 0.0050  v 0.0000 ± 0.0040  w 0.00 ± 0.12 m/s  look  2.0 s"
     assert capsys.readouterr().out == f"p1_a  {words}\n"
 
 

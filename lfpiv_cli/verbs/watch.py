@@ -257,5 +257,5 @@ class Latest:
         table = Table("The last one first", HEAD, tuple(self._rows))
         foot = f"Renews itself every {RELOAD_S} s; velocities are means, ± the usual standard error of one vector."
         sections = (Section("The last pair", "latest", pictures=shown), Section("Pairs", "pairs", tables=(table,)))
-        page = Page(f"{name}  {line}", (), (), sections, foot, reload_s=RELOAD_S)
+        page = Page(f"{name}: {line.replace('  ', ', ')}", (), (), sections, foot, reload_s=RELOAD_S)
         write_pages(page, [self.output / PAGE], overwrite=True)
