@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import sys
 import time
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -22,6 +23,8 @@ from lfpiv_cli.notice import Notice, written
 
 # Without a terminal, lines of work that is one piece are this far apart, and those within a frame that takes long.
 SECONDS_BETWEEN_LINES, SECONDS_WITHIN_FRAME = 10.0, 60.0
+# Of warnings with one code so many are printed: the same of each of a thousand pairs hides all else.
+MOST_ALIKE = 3
 # Where the summary's figures begin.
 NAME_WIDTH = 28
 # Frames count in fractions while they are worked on.
@@ -48,6 +51,7 @@ class Console:
     log: EventLog | None = None
     # Those of `warned`, to look them up in: thousands of frames may each have some.
     _told: set[Notice] = field(default_factory=set, init=False, repr=False, compare=False)
+    _printed: Counter[str] = field(default_factory=Counter, init=False, repr=False, compare=False)
 
     def event(self, name: str, /, **fields: Any) -> None:
         """Add what happens to the log."""
@@ -78,8 +82,10 @@ class Console:
                 self._told.add(notice)
                 self.warned.append(notice)
             self.event("warning", **notice.record())
-            if not self.quiet:
-                click.echo(f"lfpiv: warning: {notice}", err=True)
+            self._printed[notice.code] += 1
+            if not self.quiet and self._printed[notice.code] <= MOST_ALIKE:
+                last = "; more of these are not printed" if self._printed[notice.code] == MOST_ALIKE else ""
+                click.echo(f"lfpiv: warning: {notice}{last}", err=True)
 
     def detail(self, text: str) -> None:
         """Print a line for those who asked for more."""

@@ -117,6 +117,16 @@ def test_the_log_has_a_line_for_each_event_whatever_is_silent(clock: Clock, tmp_
     assert re.fullmatch(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d{3}\+00:00", frame["time"])
 
 
+def test_the_same_warning_of_many_files_is_printed_three_times(capsys: pytest.CaptureFixture[str]) -> None:
+    console = Console(warned=[])
+    console.warn(Notice("few-tracers", f"{number}.tif", "too few", "seed more") for number in range(5))
+    console.warn([Notice("frame-dark", "9.tif", "is dark", "more light")])
+    lines = capsys.readouterr().err.splitlines()
+    assert [line.split(" ")[2] for line in lines] == ["0.tif:", "1.tif:", "2.tif:", "9.tif:"]
+    assert lines[2].endswith("[few-tracers]; more of these are not printed")
+    assert len(console.warned or ()) == 6
+
+
 def test_a_log_is_added_to_and_nothing_else_is(tmp_path: Path) -> None:
     EventLog(tmp_path / "run.log", "track").write("start", {})
     EventLog(tmp_path / "run.log", "track").write("end", {"residual": float("nan")})
