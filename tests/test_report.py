@@ -29,7 +29,7 @@ from lfpiv_cli.files.provenance import sha256
 from lfpiv_cli.files.vtkhdf import open_vectors, write_vectors, write_volume
 from lfpiv_cli.flow.windows import ParallelWalls
 from lfpiv_cli.grid import Grid, Reference
-from lfpiv_cli.pictures.points import MOST_LINES, Lines, lines_view, wall_dots
+from lfpiv_cli.pictures.points import MOST_LINES, Lines, has_views, lines_view, wall_dots
 from lfpiv_cli.verbs import checks
 from lfpiv_cli.verbs import report as stage
 from lfpiv_cli.verbs.plot import figures_of
@@ -294,6 +294,16 @@ def test_many_pairs_stand_in_their_order_and_settings_have_no_empty_ones(
     # the series, and planes, profiles and errors of the mean
     assert len(sections["Vectors"].pictures) == summary["pictures"] == 4
     assert list(sections["Settings"].commands) == ["camera: {pitch_mm: 0.125}", "windows: [null, 8]"]
+    assert "the vectors of their mean" in sections["Vectors"].view or not has_views()
+    # of more files the first; of those by another command the series and planes of their mean
+    monkeypatch.setattr(stage, "LONGEST_TABLE", 2)
+    for number in (10, 9, 1):
+        field = field_of(flow, 9.0 * SIGMA_VOXEL)
+        write_vectors(tmp_path / f"t{number}.vtkhdf", field, REFERENCE, provenance=record("track"), overwrite=False)
+    assert report(tmp_path, tmp_path / "page.html", console=QUIET)["pictures"] == 4 + 2
+    vectors = next(section for section in pages[1].sections if section.title == "Vectors")
+    assert vectors.text == ("The first 2 of 3 files.",)
+    assert [row[0] for row in vectors.tables[0].rows] == ["p1.vtkhdf", "p9.vtkhdf"]
 
 
 @pytest.mark.thorough

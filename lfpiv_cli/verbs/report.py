@@ -5,8 +5,9 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from html import escape
 from itertools import combinations
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -73,7 +74,7 @@ SUFFIXES = (".h5", ".vtkhdf")
 # Folders below the one that is given: of volumes, of particles, of a batch's vectors.
 DEEPEST = 2
 # Tables of vectors end here, and others.
-LONGEST_TABLE, LONGEST_OTHER = 60, 20
+LONGEST_TABLE, LONGEST_OTHER = 60, 12
 # So many files of vectors are read, and so many reasons of one kind are told.
 MOST_FIELDS, MOST_REASONS = 1000, 3
 # Commands, by their records, whose vectors are made of others that stand beside them.
@@ -81,6 +82,8 @@ MEAN = "correlate mean"
 MADE_OF_OTHERS = (MEAN, "statistics", "combine")
 # What is drawn of the vectors that the verdict is of, of others, and of other files: a page of paper holds three.
 OF_VECTORS, OF_OTHERS = ("planes", "profiles", "sigma"), ("planes",)
+# Of the mean of many, in the order of what is left out first of others' means.
+OF_BATCHES = (planes_figure, profiles_figure, sigma_figure)
 OF_PARTICLES, OF_VOLUMES = ("image", "residual", "depths"), ("projections",)
 OF_STATISTICS = ("moments", "stresses", "profile", "convergence")
 OF_TRACKS, OF_WEIGHTS = ("space", "sigma"), ("light",)
@@ -305,17 +308,19 @@ class Drawer:
         chosen = [each for name, each in figures_of(path, raw).items() if not only or name in only]
         return [self._drawn(f"{path.name}: {each.caption}", each.draw()) for each in chosen]
 
-    def of_batch(self, fields: Mapping[str, VectorField]) -> list[Picture]:
-        """Return pictures of fields of one kind by name: each one's means in their order, and the mean of all."""
+    def of_batch(
+        self, command: str, fields: Mapping[str, VectorField], draws: Sequence[Callable[[VectorField], Figure]]
+    ) -> tuple[VectorField | None, list[Picture]]:
+        """Return the mean of fields by one command, by name, and pictures of means in order and of that."""
         mean, sigma = (np.array(each) for each in zip(*map(checks.velocity_of, fields.values()), strict=True))
-        found = [self._drawn(caption_of(series_figure), series_figure(list(fields), mean, sigma))]
+        words = f"The mean of {len(fields)} fields by {command}"
+        series = f"Fields by {command}: {caption_of(series_figure)}"
+        found = [self._drawn(series, series_figure(list(fields), mean, sigma))]
         try:
             whole = of_fields(fields.values()).mean
         except InputError:  # they have no mean
-            return found
-        for draw in (planes_figure, profiles_figure, sigma_figure):
-            found.append(self._drawn(f"The mean of {len(fields)} fields: {caption_of(draw)}", draw(whole)))
-        return found
+            return None, found
+        return whole, found + [self._drawn(f"{words}: {caption_of(draw)}", draw(whole)) for draw in draws]
 
     def _drawn(self, caption: str, figure: Figure) -> Picture:
         target = self.folder / f"{self.count:04d}.png"
@@ -374,30 +379,36 @@ def _chain(contents: Contents, fields: Fields, drawer: Drawer) -> Iterable[Secti
     """Yield the sections of vectors, tracks, images and calibration, as far as they are there."""
     groups, pictures, views = _by_command(contents, fields), list[Picture](), Views()
     if fields:
-        paths = [path for group in groups.values() for path in group]
-        count = len(contents.of("vectors"))
-        text, table = _batch_table(paths[:LONGEST_TABLE], count, (_field_row(fields[path]) for path in paths))
-        for number, group in enumerate(groups.values()):
+        first = next(iter(groups.values()))
+        # Of many pairs the pictures show what is by other commands, too.
+        paths = first if len(first) > 1 else [path for group in groups.values() for path in group]
+        shown = paths[:LONGEST_TABLE]
+        text, table = _batch_table(shown, len(paths), (_field_row(fields[path]) for path in shown))
+        field, named = fields[first[0]], first[0].name
+        for number, (command, group) in enumerate(groups.items()):
             if len(group) > 1:
-                pictures += drawer.of_batch({path.stem: fields[path] for path in group})
+                by_name = {path.stem: fields[path] for path in group}
+                mean, drawn = drawer.of_batch(command, by_name, OF_BATCHES[:1] if number else OF_BATCHES)
+                pictures += drawn
+                if number == 0 and mean is not None:
+                    field, named = mean, "their mean"
             else:
                 pictures += drawer.pictures(group[0], only=OF_OTHERS if number else OF_VECTORS)
-        best = paths[0]
-        view = "" if fields[best].dt_s is None else views.of(_of_field(fields[best]), contents.record(best))
-        text += (f"The view can be turned; it shows vectors of {best.name}.",) if view else ()
+        words = f"The view can be turned; it shows the vectors of {named}."
+        view = "" if field.dt_s is None else views.of(_of_field(field), contents.record(first[0]), words)
         yield Section("Vectors", "vectors", text, tables=(table,), pictures=tuple(pictures), view=view)
     for path in [path for path in fields if "pairs" in read_header(path).attributes][:1]:
         pictures = drawer.pictures(path, only=OF_STATISTICS)
         yield Section("Statistics", "statistics", tables=tuple(_statistics(path)), pictures=tuple(pictures))
-    for path in contents.of("tracks")[:1]:
-        points = open_tracks(path)
-        view = views.of(_of_points(points), contents.record(path))
-        text = (f"The view can be turned; it shows at most {MOST_LINES:,} tracks of {path.name}, {FAINT_WORDS}.",)
-        text = text if view else ()
+    tracks = contents.of("tracks")
+    for path in tracks[:1]:
+        points, which = open_tracks(path), f"the first of {len(tracks)} files, " if len(tracks) > 1 else ""
+        words = f"The view can be turned; it shows at most {MOST_LINES:,} tracks of {which}{path.name}, {FAINT_WORDS}."
+        view = views.of(_of_points(points), contents.record(path), words)
         pictures = drawer.pictures(path, only=OF_TRACKS)
         # On a screen the view shows what the first one does.
         pictures = [replace(each, on_paper=bool(view) and not number) for number, each in enumerate(pictures)]
-        yield Section("Tracks", "tracks", text, pictures=tuple(pictures), view=view)
+        yield Section("Tracks", "tracks", pictures=tuple(pictures), view=view)
     for kind, title, rows_of in (("particles", "Particles", _particle_row), ("volumes", "Volumes", _volume_row)):
         paths = contents.of(kind)
         if paths:
@@ -466,10 +477,11 @@ Row = dict[str, str]
 
 
 def _batch_table(paths: Iterable[Path], count: int, rows: Iterable[Row]) -> tuple[tuple[str, ...], Table]:
-    """Return a table of files, and words where there are more of them."""
+    """Return a table of files with what is known of any, and words where there are more of them."""
     named = [{"file": path.name} | row for path, row in zip(paths, rows, strict=True)]
     text = () if len(named) == count else (f"The first {len(named)} of {count} files.",)
-    return text, Table("Files", tuple(named[0]), tuple(tuple(row.values()) for row in named))
+    known = [head for head in named[0] if any(row[head] != UNKNOWN for row in named)]
+    return text, Table("Files", tuple(known), tuple(tuple(row[head] for head in known) for row in named))
 
 
 def _volume_row(path: Path) -> Row:
@@ -487,10 +499,11 @@ def _particle_row(path: Path) -> Row:
     sigma = np.sqrt(points.arrays["covariance_mm2"][inside, :3])
     reported = points.attributes
     return {
-        "particles": f"{np.count_nonzero(inside)}, and {np.count_nonzero(~inside)} beside the volume",
+        "particles": str(np.count_nonzero(inside)),
+        "beside the volume": str(np.count_nonzero(~inside)),
         "per microlens": _cell(reported.get("particles_per_lens")),
         "light not explained": _cell(reported.get("residual")),
-        "median sigma x, y, z (mm)": _cell(np.median(sigma, axis=0).tolist()) if inside.any() else UNKNOWN,
+        "median sigma x, y, z (mm)": readable(np.median(sigma, axis=0).tolist(), 2) if inside.any() else UNKNOWN,
         "diameter (mm)": _with_error(reported, "particle_diameter", "mm"),
         "diffusion (px)": _with_error(reported, "diffusion", "px"),
     }
@@ -504,7 +517,8 @@ def _with_error(reported: Mapping[str, Any], name: str, unit: str) -> str:
 
 def _field_row(vectors: VectorField) -> Row:
     quality, there, used = checks.quality_of(vectors), vectors.flag < REJECTED, vectors.flag < MASKED
-    moved, (mean, sigma) = vectors.displacement_voxel[there], checks.velocity_of(vectors)
+    moved, (mean, sigma) = vectors.displacement_voxel[there].reshape(-1, 3), checks.velocity_of(vectors)
+    voxels = np.median(moved, axis=0) if len(moved) else ()
     return {
         "vectors": str(quality.used),
         "valid": f"{np.mean(vectors.flag[used] == VALID):.1%}" if used.any() else UNKNOWN,
@@ -512,7 +526,7 @@ def _field_row(vectors: VectorField) -> Row:
             f"mean {name} ± usual σ of one (m/s)": with_error(each, error) if math.isfinite(each) else UNKNOWN
             for name, each, error in zip("uvw", mean.tolist(), sigma.tolist(), strict=True)
         },
-        "median moved (voxel)": readable(np.median(moved, axis=0).tolist(), 3) if len(moved) else UNKNOWN,
+        "median moved (voxel)": ", ".join(f"{each:z.2f}" for each in voxels) or UNKNOWN,
     }
 
 
@@ -543,12 +557,13 @@ class Views:
 
     count: int = 0
 
-    def of(self, lines: Lines, made: Mapping[str, Any]) -> str:
-        """Return the view of lines and of the walls that the record of their file tells of; "" where there is none."""
+    def of(self, lines: Lines, made: Mapping[str, Any], words: str) -> str:
+        """Return words and a view of lines and of the walls that the record of their file has; "" without lines."""
         if not (has_views() and lines.places_mm):
             return ""
         self.count += 1
-        return lines_view(lines, _walls(made), name=f"view{self.count}", with_script=self.count == 1)
+        view = lines_view(lines, _walls(made), name=f"view{self.count}", with_script=self.count == 1)
+        return f"<p>{escape(words)}</p>{view}"
 
 
 def _twice(values: Floats) -> list[Floats]:
@@ -565,13 +580,19 @@ def _walls(made: Mapping[str, Any]) -> Walls | None:
 
 def _records(contents: Contents) -> Iterable[Section]:
     """Yield the sections of warnings, settings and where the files come from."""
-    warned = [
-        (name, str(made.get("command")), warning["code"], f"{warning['about']}: {warning['text']}")
-        for name, made in contents.all_records.items()
-        for warning in made.get("warnings", ())
-    ]
+    # Of alike ones the first.
+    warned: dict[tuple[str, str], list[tuple[str, str]]] = {}
+    for name, made in contents.all_records.items():
+        for warning in made.get("warnings", ()):
+            alike = warned.setdefault((str(made.get("command")), warning["code"]), [])
+            alike.append((name, f"{warning['about']}: {warning['text']}"))
     if warned:
-        table = Table("As they were made", ("file", "command", "code", "warning"), tuple(warned[:LONGEST_OTHER]))
+        named = [
+            (name if len(alike) == 1 else f"{name} and {len(alike) - 1} more", *each, text)
+            for each, alike in warned.items()
+            for name, text in alike[:1]
+        ]
+        table = Table("As they were made", ("file", "command", "code", "warning"), tuple(named))
         yield Section("Warnings", "warnings", tables=(table,))
     last = contents.last
     if last.get("config"):
