@@ -244,6 +244,13 @@ def test_shear_within_a_bin_is_no_fluctuation(rng: np.random.Generator) -> None:
     assert found.summary()["negative_variances"] != [0, 0, 0]
 
 
+def test_without_any_tracks_no_place_has_statistics() -> None:
+    pair = tracks_of(np.zeros((0, 3)), np.zeros((0, 3)), SIGMA_MM)
+    numbers = dict.fromkeys(("track", "frame", "particle"), np.zeros(0, np.int64))
+    for each in (pair, replace(pair, arrays=pair.arrays | numbers)):
+        assert (of_tracks([each], None, 20, "z").mean.flag == REJECTED).all()
+
+
 def test_curved_means_in_bins_are_told(rng: np.random.Generator) -> None:
     def curved(places: NDArray[np.float64], _number: int) -> NDArray[np.float64]:
         return np.stack([0.3 - 0.06 * places[:, 2] ** 2, *np.zeros((2, len(places)))], axis=1)

@@ -208,7 +208,7 @@ def samples_of_tracks(points: Points, frame: int | None = None) -> Samples:
     if "frame" in arrays:
         last = int(arrays["frame"].max(initial=-1))
         number = (last + 1) // 2 if frame is None else frame
-        if not 0 <= number <= last:
+        if not 0 <= number <= max(last, 0):
             raise UsageError(f"frame {number} is none of {last + 1}, which are counted from 0")
         # Places and velocities of fits in time.
         here, to_mm = arrays["frame"] == number, float(points.attributes["dt_s"]) / MM_TO_M

@@ -301,7 +301,8 @@ def of_tracks(
         ensure_one_time(each.attributes.get("dt_s") for each in (first, points))
         if points.reference != first.reference:
             raise InputError("the tracks' coordinates have different origins")
-        frames = range(int(points.arrays["frame"].max(initial=-1)) + 1) if "frame" in points.arrays else [None]
+        # Of a sequence without tracks the first frame alone, with none.
+        frames = range(int(points.arrays["frame"].max(initial=0)) + 1) if "frame" in points.arrays else [None]
         kept += [samples_of_tracks(points, frame) for frame in frames]
     if first is None:
         raise InputError("there are no tracks to take statistics of")
