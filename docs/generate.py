@@ -146,6 +146,8 @@ def interface() -> Iterator[str]:
     classes = [thing for thing in promised if inspect.isclass(thing)]
     returned = {typing.get_type_hints(function)["return"] for function in functions}
     ours = {thing for thing in returned if inspect.isclass(thing) and thing.__module__.startswith("lfpiv_cli.")}
+    # What all of them can do, once.
+    ours |= {base for thing in ours for base in thing.__mro__ if base.__module__ == "lfpiv_cli.results"}
     yield "```{eval-rst}"
     for function in functions:
         yield f".. autofunction:: lfpiv_cli.{function.__name__}\n"

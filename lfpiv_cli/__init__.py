@@ -42,6 +42,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from lfpiv_cli.files.kernel_cache import ensure_place
+from lfpiv_cli.results import Result
 
 if TYPE_CHECKING:
     from lfpiv_cli.errors import LfpivError as LfpivError
@@ -53,10 +54,10 @@ if TYPE_CHECKING:
     from lfpiv_cli.files.vtkhdf import open_vectors as open_vectors
     from lfpiv_cli.files.vtkhdf import open_volume as open_volume
     from lfpiv_cli.files.weights_file import open_weights as open_weights
-    from lfpiv_cli.flow.combining import combine as combine
     from lfpiv_cli.notice import LfpivWarning as LfpivWarning
     from lfpiv_cli.verbs.build_weights import build_weights as build_weights
     from lfpiv_cli.verbs.calibrate import calibrate as calibrate
+    from lfpiv_cli.verbs.combine import combine as combine
     from lfpiv_cli.verbs.correlate import correlate as correlate
     from lfpiv_cli.verbs.fields import fit_field as fit_field
     from lfpiv_cli.verbs.following import follow as follow
@@ -74,7 +75,7 @@ MODULES = {
     "LfpivWarning": "notice",
     "build_weights": "verbs.build_weights",
     "calibrate": "verbs.calibrate",
-    "combine": "flow.combining",
+    "combine": "verbs.combine",
     "correlate": "verbs.correlate",
     "find_particles": "verbs.particles",
     "fit_field": "verbs.fields",
@@ -93,8 +94,9 @@ MODULES = {
 }
 __all__ = ["__version__", *MODULES]
 
-# Before any kernel is imported.
+# Before any kernel, and any result, is imported.
 ensure_place()
+Result.ways = staticmethod(lambda: import_module(f"{__name__}.verbs.results"))
 
 
 def __getattr__(name: str) -> Any:

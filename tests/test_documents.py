@@ -304,13 +304,16 @@ def test_every_command_runs(page, furnished, tmp_path) -> None:
 
 
 @pytest.mark.slow
-def test_the_python_page_runs(furnished, capsys) -> None:
+def test_the_python_page_runs(furnished, tmp_path, capsys) -> None:
+    shutil.copytree(furnished, tmp_path, dirs_exist_ok=True)
     blocks = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "python.md").read_text(), re.DOTALL)
-    with contextlib.chdir(furnished):
+    with contextlib.chdir(tmp_path):
         exec(compile("\n".join(blocks), "docs/python.md", "exec"), {})
     printed = capsys.readouterr().out
     assert "u = 0.1" in printed
     assert "valid vectors" in printed
+    assert "Combined: 5 x 3 x 6 vectors" in printed
+    assert (tmp_path / "profiles.png").stat().st_size > 10_000
 
 
 def test_the_python_page_uses_what_is_promised() -> None:

@@ -6,7 +6,7 @@ Axes: pixels are (column, row); world axes are those of the raw sensor, z away f
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -35,6 +35,7 @@ from lfpiv_cli.names import Layout
 from lfpiv_cli.optics.camera import Camera, refocused
 from lfpiv_cli.optics.media import Media
 from lfpiv_cli.optics.shapes import ScenePose
+from lfpiv_cli.results import Result
 
 # A measured magnification replaces the data sheet's when it differs by more standard errors than chance explains.
 MAGNIFICATION_SIGMAS = 3.0
@@ -74,8 +75,8 @@ class Rig:
     light: WaveLight | None = None
 
 
-@dataclass(frozen=True, eq=False)
-class Calibration:
+@dataclass(frozen=True, eq=False, repr=False)
+class Calibration(Result):
     """What was measured.
 
     Attributes
@@ -90,6 +91,7 @@ class Calibration:
     ray_fit : polynomials of rays from boards at several depths, in the rectified frame, or None
     scene : where the faces before the fluid lie, from where the config has them, or None
     white : (rows, columns) float32, raw uniform light over that of a full lens image, where the transmission is known
+    provenance : the record of how it was made
     """
 
     rectification: Rectification
@@ -104,6 +106,7 @@ class Calibration:
     mid_plane_given: bool = False
     scene: ScenePose | None = None
     white: Singles | None = None
+    provenance: dict[str, Any] = field(default_factory=dict)
 
     @property
     def fit(self) -> LatticeFit:

@@ -9,7 +9,7 @@ group.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -86,9 +86,9 @@ def open_calibration(path: Path | str) -> Calibration:
     InputError
         The file is missing, broken, or of another format or version.
     """
-    tree, _ = read_tree(Path(path), FORMAT, VERSION)
+    tree, provenance = read_tree(Path(path), FORMAT, VERSION)
     try:
-        return calibration_of(tree)
+        return replace(calibration_of(tree), provenance=provenance)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
 

@@ -35,6 +35,7 @@ from lfpiv_cli.files.hdf5 import (
 from lfpiv_cli.files.inputs import reason
 from lfpiv_cli.files.vtkhdf import create_vtk_group, mark_active, read_root, write_root
 from lfpiv_cli.grid import Reference
+from lfpiv_cli.results import ArrayResult
 
 # The places of a sequence's tracks on a disk: put there a frame at a time, read by frame or by track.
 #
@@ -193,8 +194,8 @@ NOT_ONE_VALUE = "{}: {} has not one finite value for each of its {} points"
 CELLS = ("Vertices", "Lines", "Polygons", "Strips")
 
 
-@dataclass(frozen=True, eq=False)
-class Points:
+@dataclass(frozen=True, eq=False, repr=False)
+class Points(ArrayResult):
     """Points with their quantities.
 
     Attributes
@@ -219,6 +220,12 @@ class Points:
     def count(self) -> int:
         """How many points there are."""
         return len(self.position_mm)
+
+    @property
+    def format_name(self) -> str:
+        """The format of a file of such points."""
+        tracks = TRACKS_FORMAT if "displacement_mm" in self.arrays else PARTICLES_FORMAT
+        return TRAJECTORIES_FORMAT if "track" in self.arrays else tracks
 
     def rows(self, name: str) -> Iterator[NDArray[Any]]:
         """Yield the rows of an array, or of the positions, all in one piece."""

@@ -32,6 +32,7 @@ from lfpiv_cli.files.hdf5 import (
 )
 from lfpiv_cli.flow.field import REJECTED, VectorField
 from lfpiv_cli.grid import Grid, Reference
+from lfpiv_cli.results import ArrayResult
 
 # What all `*.vtkhdf` files have in common: VTK's header, and what a file says about itself at its root.
 
@@ -101,8 +102,8 @@ def write_root(
     for name, value in (reference.attributes() | dict(attributes)).items():
         if name in RESERVED:
             raise ValueError(f"{name} is a name that every file uses for itself")
-        if isinstance(value, np.ndarray):
-            file.attrs[name] = value
+        if isinstance(value, (np.ndarray, list)):
+            file.attrs[name] = np.asarray(value)
         elif value is not None:
             file.attrs[name] = to_attribute(value)
 
@@ -140,8 +141,8 @@ FLAG_MEANINGS = "0 valid, 1 replaced, 2 second peak, 3 rejected and not replaced
 LARGEST_FLAG = 4
 
 
-@dataclass(frozen=True, eq=False)
-class Volume:
+@dataclass(frozen=True, eq=False, repr=False)
+class Volume(ArrayResult):
     """A volume with its place in the world.
 
     Attributes
@@ -224,21 +225,32 @@ def write_vectors(
     tables : arrays of other shapes, by the name of their group and their own, with their unit
     """
     with created(path, overwrite=overwrite, check=open_vectors) as file:
-        write_root(file, VECTORS_FORMAT, FORMAT_VERSION, reference, attributes or {}, provenance)
-        file.attrs["voxel_mm"] = np.asarray(field.voxel_mm, dtype=np.float64)
-        file.attrs["window_voxel"] = np.asarray(field.window_voxel, dtype=np.int64)
-        file.attrs["flag_meanings"] = np.bytes_(FLAG_MEANINGS)
-        if field.dt_s is not None:
-            file.attrs["dt_s"] = float(field.dt_s)
-        arrays = {"velocity": (field.velocity, "m/s")}
-        arrays |= {name: (getattr(field, name), unit) for name, (unit, _) in VECTOR_ARRAYS.items()}
-        if field.uncertainty_voxel is not None:
-            arrays[UNCERTAINTY] = (field.uncertainty_voxel, "voxel")
-        _write_on_grid(file, field.grid, arrays | dict(extra or {}))
+        said = attributes_of(field) | dict(attributes or {})
+        write_root(file, VECTORS_FORMAT, FORMAT_VERSION, reference, said, provenance)
+        _write_on_grid(file, field.grid, arrays_of(field) | dict(extra or {}))
         for table, columns in (tables or {}).items():
             group = file.create_group(table)
             for name, (array, unit) in columns.items():
                 write_array(group, name, array, unit)
+
+
+def attributes_of(field: VectorField) -> dict[str, Any]:
+    """Return what a file of vectors says of itself, besides the origin of its coordinates."""
+    return {
+        "voxel_mm": np.asarray(field.voxel_mm, dtype=np.float64),
+        "window_voxel": np.asarray(field.window_voxel, dtype=np.int64),
+        "flag_meanings": FLAG_MEANINGS,
+        "dt_s": None if field.dt_s is None else float(field.dt_s),
+    }
+
+
+def arrays_of(field: VectorField) -> dict[str, tuple[NDArray[Any], str]]:
+    """Return the arrays of a file of vectors by name, with their units."""
+    arrays: dict[str, tuple[NDArray[Any], str]] = {"velocity": (field.velocity, "m/s")}
+    arrays |= {name: (getattr(field, name), unit) for name, (unit, _) in VECTOR_ARRAYS.items()}
+    if field.uncertainty_voxel is not None:
+        arrays[UNCERTAINTY] = (field.uncertainty_voxel, "voxel")
+    return arrays
 
 
 def open_vectors(path: Path | str) -> VectorField:
@@ -256,6 +268,7 @@ def open_vectors(path: Path | str) -> VectorField:
         voxel = [float(v) for v in file.attrs["voxel_mm"]]
         window = [int(v) for v in file.attrs["window_voxel"]]
         dt_s = float(file.attrs["dt_s"]) if "dt_s" in file.attrs else None
+        root = read_root(file)
     uncertainty = arrays.pop(UNCERTAINTY, None)
     if arrays["flag"].max() > LARGEST_FLAG:
         raise InputError(f"{path}: a flag is {arrays['flag'].max()}, allowed are 0 to {LARGEST_FLAG}")
@@ -265,6 +278,8 @@ def open_vectors(path: Path | str) -> VectorField:
         dt_s=dt_s,
         window_voxel=(window[0], window[1], window[2]),
         uncertainty_voxel=uncertainty,
+        reference=root.reference,
+        provenance=root.provenance,
         **arrays,
     )
     if not np.isfinite(field.displacement_voxel[field.flag < REJECTED]).all():

@@ -62,6 +62,7 @@ from lfpiv_cli.optics.curved_space import CurvedSpace
 from lfpiv_cli.optics.media import Media, Window
 from lfpiv_cli.optics.surfaces import SURFACES
 from lfpiv_cli.optics.tracing import ObjectSpace
+from lfpiv_cli.results import Result
 from lfpiv_cli.simd import COEFFICIENTS
 from lfpiv_cli.weights.axis import AxisWeights
 from lfpiv_cli.weights.columns import ColumnOperator, OnDemandOperator
@@ -136,8 +137,8 @@ class StoredSpace(Section):
 Stored = TypeVar("Stored", bound=Section)
 
 
-@dataclass(frozen=True, eq=False)
-class WeightsFile:
+@dataclass(frozen=True, eq=False, repr=False)
+class WeightsFile(Result):
     """Weights with what the file says about them.
 
     Attributes
@@ -147,6 +148,7 @@ class WeightsFile:
     reference : the origin of the coordinates of volumes; the weights' own grid counts z from the nominal focal point
     vignetting : of `calibration.transmission`, in the weights once they are read; None where it was not measured
     provenance : record of how the file was made
+    stored : the weights without the vignetting, as a file holds them; None where `weights` are
     """
 
     weights: Weights
@@ -154,6 +156,7 @@ class WeightsFile:
     reference: Reference
     provenance: dict[str, Any]
     vignetting: NDArray[np.float64] | None = None
+    stored: WeightsOperator | None = None
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -195,8 +198,9 @@ class WeightsFile:
         """Return the same with the vignetting in the weights, as a file has it once it is read."""
         if self.passed is None:
             return self
-        operator = self.weights.solver_operator.behind(self.passed)
-        return replace(self, weights=replace(self.weights, solver_operator=operator))
+        bare = self.weights.solver_operator
+        behind = replace(self.weights, solver_operator=bare.behind(self.passed))
+        return replace(self, weights=behind, stored=bare)
 
 
 def write_weights(path: Path, content: WeightsFile, overwrite: bool) -> None:
@@ -219,7 +223,7 @@ def write_weights(path: Path, content: WeightsFile, overwrite: bool) -> None:
         },
         "vignetting": content.vignetting,
         "calibration": calibration_file.tree_of(weights.calibration) if weights.calibration else None,
-    } | _operator_tree(weights.solver_operator)
+    } | _operator_tree(content.stored or weights.solver_operator)
     made = content.provenance
     write_tree(
         path, tree, format_name=FORMAT, format_version=VERSION, provenance=made, overwrite=overwrite, units=UNITS

@@ -28,6 +28,7 @@ from lfpiv_cli.flow.field import MASKED, REJECTED, REPLACED, SECOND_PEAK, VALID,
 from lfpiv_cli.flow.outliers import NEEDED_SHARE, predict
 from lfpiv_cli.flow.windows import Triple, Walls, layout_windows
 from lfpiv_cli.grid import Grid
+from lfpiv_cli.results import ArrayResult
 from lfpiv_cli.tracks.gridding import on_grid
 
 # Vectors further apart than this, in units of the uncertainty of their difference, are not of one flow: by chance one
@@ -47,8 +48,8 @@ SAME_PLACE_VOXEL = 1e-5
 WEIGHED, UNWEIGHED, FILLED, NONE = 3, 2, 1, 0
 
 
-@dataclass(frozen=True, eq=False)
-class Combined:
+@dataclass(frozen=True, eq=False, repr=False)
+class Combined(ArrayResult):
     """A combined field, and how it came about.
 
     Attributes
@@ -66,6 +67,10 @@ class Combined:
     disagreement: Floats
     left_out: Flags
     widened: Floats
+
+    def arrays(self) -> dict[str, tuple[Floats, str]]:
+        """Return the arrays on the grid besides the field's, with the names and units that files give them."""
+        return {"share_a": (self.first_share, "1"), "disagreement": (self.disagreement, "1")}
 
 
 def combine(first: VectorField, second: VectorField) -> Combined:

@@ -8,12 +8,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from dataclasses import field as field_of
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lfpiv_cli.arrays import Floats
-from lfpiv_cli.grid import Grid
+from lfpiv_cli.grid import FOCAL_POINT, Grid, Reference
+from lfpiv_cli.results import ArrayResult
 from lfpiv_cli.robust import HALF_NORMAL_MEDIAN
 
 # Flags, in the order of decreasing trust. A velocity is finite up to SECOND_PEAK and NaN from REJECTED on.
@@ -28,8 +31,8 @@ FLAG_NAMES = {VALID: "valid", SECOND_PEAK: "second peak", REPLACED: "replaced", 
 MM_TO_M = 1e-3
 
 
-@dataclass(frozen=True, eq=False)
-class VectorField:
+@dataclass(frozen=True, eq=False, repr=False)
+class VectorField(ArrayResult):
     """Displacements between two volumes at the centres of the correlation windows.
 
     Attributes
@@ -45,6 +48,8 @@ class VectorField:
     voxel_mm : size of a voxel along x, y, z
     dt_s : time between the volumes, or None where it is not known
     window_voxel : size of the final windows along x, y, z
+    reference : the origin of its coordinates
+    provenance : the record of how it was made
     """
 
     grid: Grid
@@ -58,6 +63,8 @@ class VectorField:
     voxel_mm: tuple[float, float, float]
     dt_s: float | None
     window_voxel: tuple[int, int, int]
+    reference: Reference = FOCAL_POINT
+    provenance: dict[str, Any] = field_of(default_factory=dict)
 
     @property
     def flag_counts(self) -> dict[str, int]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -94,7 +94,7 @@ def calibrate(
     pictures = photographs(whites, boards, dark, depth_mm)
     found = calibration_of(rig, pictures)
     warn_of(calibration_notices(rig, pictures, found))
-    return found
+    return replace(found, provenance=provenance_record("calibrate-snapshot", rig.resolved(), {}))
 
 
 def photographs(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +14,33 @@ from lfpiv_cli.files import vtkhdf
 from lfpiv_cli.files.atomic import ensure_writable
 from lfpiv_cli.files.batch import is_kept
 from lfpiv_cli.files.provenance import OF_COORDINATES, ensure_agreement, record
-from lfpiv_cli.flow.combining import combine
-from lfpiv_cli.flow.field import MASKED, REJECTED
+from lfpiv_cli.flow.combining import Combined
+from lfpiv_cli.flow.combining import combine as weighted
+from lfpiv_cli.flow.field import MASKED, REJECTED, VectorField
+
+
+def combine(first: VectorField, second: VectorField) -> Combined:
+    """Return one field of two that measured the same flow on one grid, weighted by their uncertainties.
+
+    Parameters
+    ----------
+    first, second : VectorField
+        From `correlate`, `fit_field`, `Tracked.vectors` or `open_vectors`.
+
+    Returns
+    -------
+    Combined
+        `field` is masked where either is, rejected where neither has a vector; `first_share` and `disagreement` tell
+        how each vector came about.
+
+    Raises
+    ------
+    InputError
+        The fields differ in grid, voxels or time.
+    """
+    found = weighted(first, second)
+    made = record("combine", first.provenance.get("config"), {})
+    return replace(found, field=replace(found.field, provenance=made))
 
 
 def combine_vectors(
@@ -38,9 +64,10 @@ def combine_vectors(
         if is_kept([output], made, inputs.values(), overwrite):
             return {"vectors": vtkhdf.open_vectors(output).flag.size}
         overwrite = True
-    found = combine(*(vtkhdf.open_vectors(path) for path in inputs.values()))
-    extra = {"share_a": (found.first_share, "1"), "disagreement": (found.disagreement, "1")}
-    vtkhdf.write_vectors(output, found.field, headers[0].reference, provenance=made, overwrite=overwrite, extra=extra)
+    found = weighted(*(vtkhdf.open_vectors(path) for path in inputs.values()))
+    vtkhdf.write_vectors(
+        output, found.field, headers[0].reference, provenance=made, overwrite=overwrite, extra=found.arrays()
+    )
     return {
         "vectors": found.field.flag.size,
         "weighted": int(np.count_nonzero(np.isfinite(found.disagreement) & ~found.left_out)),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from dataclasses import fields as fields_of
 from functools import partial
 from pathlib import Path
@@ -91,7 +91,8 @@ def correlate(
     quality, name = checks.quality_of(field), "the field"
     against_field = [*checks.field_notices(quality, name), *checks.pair_notices(field, quality, name)]
     warn_of([*checks.window_notices(first, windows, "the first volume"), *against_field])
-    return field
+    made = provenance.record("correlate", chosen.resolved() if config else None, {})
+    return replace(field, reference=first.reference, provenance=made)
 
 
 def usable_voxels(settings: Config, grid: Grid, mask: NDArray[Any] | None) -> NDArray[np.bool_] | None:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from lfpiv_cli.fields.spline_field import SplineField, gradient_covariance_at
 from lfpiv_cli.fields.structure import Samples, joined
 from lfpiv_cli.files.config import Config
 from lfpiv_cli.files.particle_file import Points, matrices
+from lfpiv_cli.files.provenance import record
 from lfpiv_cli.flow import field as vector_field
 from lfpiv_cli.flow.combining import WindowGrid, without_tracks
 from lfpiv_cli.flow.field import (
@@ -26,8 +28,10 @@ from lfpiv_cli.flow.field import (
     derived_from,
 )
 from lfpiv_cli.flow.windows import ParallelWalls
+from lfpiv_cli.grid import FOCAL_POINT, Reference
 from lfpiv_cli.names import Divergence
 from lfpiv_cli.notice import Notice
+from lfpiv_cli.results import ArrayResult
 from lfpiv_cli.verbs.tracks import Tracked, TracksOf, windows_of
 
 # Fewer samples do not tell a field of three components that varies along three axes.
@@ -42,8 +46,8 @@ LARGEST_CHI2 = 2.0
 LEAST_BELONGING = 0.85
 
 
-@dataclass(frozen=True, eq=False)
-class FittedField:
+@dataclass(frozen=True, eq=False, repr=False)
+class FittedField(ArrayResult):
     """A velocity field that is known at any point.
 
     Attributes
@@ -53,6 +57,8 @@ class FittedField:
     middles_mm : (n, 3) places of the samples
     dt_s : time from one frame to the next
     summary : counts and figures, units in their names
+    reference : the origin of its coordinates
+    provenance : the record of how it was made
     """
 
     field: fit.Field
@@ -60,6 +66,8 @@ class FittedField:
     middles_mm: Floats
     dt_s: float
     summary: dict[str, Any]
+    reference: Reference = FOCAL_POINT
+    provenance: dict[str, Any] = dataclasses.field(default_factory=dict)
 
     def at(self, points_mm: Floats) -> Floats:
         """Return velocities (m, 3) at points, m/s."""
@@ -126,7 +134,8 @@ class FittedField:
         """Return the vectors at the windows' centres; none where no sample is near, and none beyond walls."""
         value, variance = self.field.estimate_at(self.windows.centres.centres_mm().reshape(-1, 3))
         value[self.without().reshape(-1)] = np.nan
-        return self.windows.vectors(value, np.sqrt(variance), self.dt_s)
+        found = self.windows.vectors(value, np.sqrt(variance), self.dt_s)
+        return replace(found, reference=self.reference, provenance=self.provenance)
 
 
 def fit_field(
@@ -159,13 +168,15 @@ def fit_field(
         raise InputError("vectors alone do not tell the grid: give the rig")
     times = (each.settings.correlation.dt_s if isinstance(each, Tracked) else each.dt_s for each in given)
     ensure_one_time([*times, settings.correlation.dt_s])
-    if len({each.points.reference for each in given if isinstance(each, Tracked)}) > 1:
-        raise InputError("the tracks' coordinates have different origins")
+    references = {each.points.reference if isinstance(each, Tracked) else each.reference for each in given}
+    if len(references) > 1:
+        raise InputError("the coordinates of what is given have different origins")
     parts = [
         samples_of_tracks(each.points) if isinstance(each, Tracked) else samples_of_vectors(each, "vectors")
         for each in given
     ]
-    return fitted(parts, settings, divergence, "field")
+    made = record("field", settings.resolved() | {"field": {"divergence": divergence}}, {})
+    return replace(fitted(parts, settings, divergence, "field"), reference=references.pop(), provenance=made)
 
 
 def ensure_one_time(times_s: Iterable[float | None]) -> None:

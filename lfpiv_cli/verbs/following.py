@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -64,7 +64,7 @@ class Followed:
     tracks : through them
     """
 
-    particles: list[Points]
+    particles: list[Points] = field(repr=False)
     tracks: Tracked
 
 

@@ -17,6 +17,7 @@ from lfpiv_cli.fields.structure import Samples
 from lfpiv_cli.files.atomic import without_nan
 from lfpiv_cli.files.config import Config, carried_config
 from lfpiv_cli.files.particle_file import Points, symmetric
+from lfpiv_cli.files.provenance import record
 from lfpiv_cli.flow import statistics as flow_statistics
 from lfpiv_cli.flow.correlation import SMALLEST_VALID_FRACTION
 from lfpiv_cli.flow.field import MASKED, MM_TO_M, REJECTED, SECOND_PEAK, VALID, VectorField
@@ -24,6 +25,7 @@ from lfpiv_cli.flow.statistics import ENERGY, MEAN, RMS, SKEWNESS, STRESS, STRES
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.notice import Notice, warn_of, written
 from lfpiv_cli.pictures.vectors import mean_of_known
+from lfpiv_cli.results import ArrayResult
 from lfpiv_cli.verbs.fields import Extra, ensure_one_time, samples_of_tracks
 from lfpiv_cli.verbs.tracks import Tracked, windows_of
 
@@ -99,8 +101,8 @@ def profile_on(grid: Grid, text: str) -> Profile:
     return Profile(text, ("axial", "radial", "azimuthal"), np.bincount(point, distance) / count, point, turn)
 
 
-@dataclass(frozen=True, eq=False)
-class FlowStatistics:
+@dataclass(frozen=True, eq=False, repr=False)
+class FlowStatistics(ArrayResult):
     """Statistics of a flow over many pairs.
 
     Attributes
@@ -159,8 +161,20 @@ class FlowStatistics:
             columns |= self.named(found, "reynolds_stress")
         return {name: (array.reshape(*shape, *array.shape[1:]), unit) for name, (array, unit) in columns.items()}
 
+    def attributes(self) -> dict[str, Any]:
+        """Return what a file says of them, besides what it says of their mean."""
+        told = {
+            "pairs": self.pairs,
+            "integral_time_pairs": 0.5 * self.found.tau,
+            "block_pairs": self.found.block,
+        }
+        line = self.profile
+        return told | ({} if line is None else {"profile": line.name, "profile_components": ", ".join(line.components)})
+
     def tables(self) -> dict[str, Extra]:
-        """Return the profile and the convergence, as the groups of a file."""
+        """Return the profile and the convergence, as the groups of a file; none where the time is not known."""
+        if self.mean.dt_s is None:
+            return {}
         spread = self.found.spread * self.scales
         tables: dict[str, Extra] = {
             "convergence": {
@@ -246,7 +260,9 @@ def statistics(
         raise UsageError("statistics are of fields, or of tracks in bins, not of both")
     found = of_fields(fields, profile) if fields else of_tracks(tracks, bin_mm, fewest, profile)
     warn_of(notices_of(found.summary(), "the statistics"))
-    return found
+    chosen = {"profile": profile} | ({} if fields else {"bin_mm": bin_mm, "fewest": fewest})
+    made = record("statistics", (found.mean.provenance.get("config") or {}) | {"statistics": chosen}, {})
+    return replace(found, mean=replace(found.mean, provenance=made))
 
 
 def of_fields(fields: Iterable[VectorField], profile: str | None = None) -> FlowStatistics:
@@ -337,6 +353,8 @@ def of_tracks(
         *(grid, zeros, zeros, unknown, unknown, share, flag, zeros, voxel),
         float(first.attributes["dt_s"]),
         (size[0], size[1], size[2]),
+        first.reference,
+        first.provenance,
     )
     mean = _mean_field(empty, found, share < SMALLEST_VALID_FRACTION, np.stack([unknown, unknown, share]))
     left_out = int(np.count_nonzero(inside & ~sure))

@@ -6,10 +6,13 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from lfpiv_cli.calibration.model import Calibration
 from lfpiv_cli.console import CONSOLE, Console
 from lfpiv_cli.errors import ConfigError, InputError, UsageError
 from lfpiv_cli.files import calibration_file, vtkhdf, weights_file
@@ -17,18 +20,25 @@ from lfpiv_cli.files.atomic import ensure_writable
 from lfpiv_cli.files.calibration_file import open_calibration
 from lfpiv_cli.files.config import carried_config
 from lfpiv_cli.files.figures import FIGURES, describe, is_recording, recording_figures
-from lfpiv_cli.files.hdf5 import format_of, member, open_h5
+from lfpiv_cli.files.hdf5 import format_of
 from lfpiv_cli.files.images import read_single
 from lfpiv_cli.files.inputs import given
 from lfpiv_cli.files.pages import ensure_drawing, write_pdf, write_picture
-from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, TRACKS_FORMAT, TRAJECTORIES_FORMAT, Points, read_points
+from lfpiv_cli.files.particle_file import (
+    PARTICLES_FORMAT,
+    TRACKS_FORMAT,
+    TRAJECTORIES_FORMAT,
+    Points,
+    open_tracks,
+    read_points,
+)
 from lfpiv_cli.files.weights_file import FORMAT, WeightsFile, open_weights
 from lfpiv_cli.flow.field import VectorField
 from lfpiv_cli.notice import written
-from lfpiv_cli.pictures import calibration as of_calibration
+from lfpiv_cli.pictures import calibration as pictures
 from lfpiv_cli.pictures import points as of_points
 from lfpiv_cli.pictures import statistics as of_statistics
-from lfpiv_cli.pictures import vectors as of_vectors
+from lfpiv_cli.pictures import vectors
 from lfpiv_cli.pictures.style import caption_of
 from lfpiv_cli.verbs.frames import residual_path
 
@@ -61,33 +71,46 @@ class Drawn:
 Figures = dict[str, "Drawn | Callable[[], Figure]"]
 
 
-def _of_vectors(path: Path) -> Figures:
-    field = vtkhdf.open_vectors(path)
+def of_vectors(
+    field: VectorField,
+    arrays: Mapping[str, NDArray[Any]] = MappingProxyType({}),
+    tables: Mapping[str, Mapping[str, NDArray[Any]]] = MappingProxyType({}),
+    said: Mapping[str, Any] = MappingProxyType({}),
+) -> Figures:
+    """Return the figures of vectors; with arrays and tables besides, and what a file says of itself, of these, too."""
     figures: Figures = {
-        "planes": partial(of_vectors.planes_figure, field),
-        "components": partial(of_vectors.components_figure, field),
-        "profiles": partial(of_vectors.profiles_figure, field),
+        "planes": partial(vectors.planes_figure, field),
+        "components": partial(vectors.components_figure, field),
+        "profiles": partial(vectors.profiles_figure, field),
     }
     if field.uncertainty_voxel is not None and np.isfinite(field.uncertainty_voxel).any():
-        figures["sigma"] = partial(of_vectors.sigma_figure, field)
-    figures["flags"] = partial(of_vectors.flags_figure, field)
+        figures["sigma"] = partial(vectors.sigma_figure, field)
+    figures["flags"] = partial(vectors.flags_figure, field)
     # Not what is alike everywhere.
-    with open_h5(path) as file:
-        known = {QUALITIES[name]: np.asarray(member(file, name)) for name in QUALITIES if name in file}
-    reshaped = {words: values.reshape(field.flag.shape) for words, values in known.items()}
-    qualities = {words: each for words, each in reshaped.items() if np.unique(each[np.isfinite(each)]).size > 1}
+    known = {QUALITIES[name]: arrays[name] if name in arrays else getattr(field, name, None) for name in QUALITIES}
+    qualities = {
+        words: each for words, each in known.items() if each is not None and np.unique(each[np.isfinite(each)]).size > 1
+    }
     if qualities:
         caption = f"What else tells how good vectors are: {', '.join(qualities)}."
-        figures["quality"] = Drawn(caption, partial(of_vectors.quality_figure, field, qualities))
-    figures["displacements"] = partial(of_vectors.displacements_figure, field, _lens_mm(path))
+        figures["quality"] = Drawn(caption, partial(vectors.quality_figure, field, qualities))
+    figures["displacements"] = partial(vectors.displacements_figure, field, _lens_mm(field.provenance))
     if field.dt_s is not None:
-        figures["gradients"] = partial(of_vectors.gradients_figure, field)
-    return figures | _of_statistics(path, field)
+        figures["gradients"] = partial(vectors.gradients_figure, field)
+    return figures | _of_statistics(field, arrays, tables, said)
 
 
-def _of_statistics(path: Path, field: VectorField) -> Figures:
+def _of_vectors_in(path: Path) -> Figures:
+    return of_vectors(vtkhdf.open_vectors(path), *vtkhdf.read_extra(path), vtkhdf.read_header(path).attributes)
+
+
+def _of_statistics(
+    field: VectorField,
+    arrays: Mapping[str, NDArray[Any]],
+    tables: Mapping[str, Mapping[str, NDArray[Any]]],
+    said: Mapping[str, Any],
+) -> Figures:
     """Return the figures of statistics over many pairs, where vectors are their mean."""
-    arrays, tables = vtkhdf.read_extra(path)
     if "convergence" not in tables:
         return {}
     figures: Figures = {
@@ -95,7 +118,6 @@ def _of_statistics(path: Path, field: VectorField) -> Figures:
         "stresses": partial(of_statistics.stresses_figure, field.grid, arrays),
     }
     if "profile" in tables:
-        said = vtkhdf.read_header(path).attributes
         names = said["profile_components"].split(", ")
         figures["profile"] = partial(of_statistics.profile_figure, said["profile"], names, tables["profile"])
     pairs, *spreads = (tables["convergence"][name] for name in ("pairs", "velocity_spread", "reynolds_stress_spread"))
@@ -104,31 +126,37 @@ def _of_statistics(path: Path, field: VectorField) -> Figures:
     return figures
 
 
-def _lens_mm(path: Path) -> float | None:
-    """Return the width of a microlens in the scene; None where the file does not say with what camera it was taken.
+def _lens_mm(provenance: Mapping[str, Any]) -> float | None:
+    """Return the width of a microlens in the scene; None where the record does not say with what camera it was taken.
 
     Nor does one whose config is that of another version, which must not keep its figures from being drawn.
     """
     try:
-        config = carried_config(vtkhdf.read_header(path).provenance, path)
+        config = carried_config(provenance, "vectors")
         return config.camera_model().scale(config.media_model()).lens_mm
     except (InputError, ConfigError):
         return None
 
 
-def _of_particles(path: Path, raw: Path | None) -> Figures:
-    points = read_points(path, PARTICLES_FORMAT)
-    arrays, z_mm = points.arrays, points.position_mm[:, 2]
-    figures: Figures = {"places": partial(of_points.places_figure, points.position_mm, arrays["intensity"])}
+def _of_particles_in(path: Path, raw: Path | None) -> Figures:
+    points, left = read_points(path, PARTICLES_FORMAT), residual_path(path)
+    figures = of_particles(points)
+    on_images: Figures = {}
     if raw is not None:
         config = carried_config(points.provenance, path)
         focal_point = points.reference.points_to_focal_point(points.position_mm)
         places = of_points.places_px(focal_point, config.camera_model(), config.media_model(), config.scene_space())
-        image = read_single(raw, config.image_shape()).astype(np.float64)
-        figures["image"] = partial(of_points.image_figure, image, places, z_mm)
-    left = residual_path(path)
+        image, z_mm = read_single(raw, config.image_shape()).astype(np.float64), points.position_mm[:, 2]
+        on_images["image"] = partial(of_points.image_figure, image, places, z_mm)
     if left.is_file():
-        figures["residual"] = partial(of_points.residual_figure, read_single(left).astype(np.float64))
+        on_images["residual"] = partial(of_points.residual_figure, read_single(left).astype(np.float64))
+    return {"places": figures.pop("places")} | on_images | figures
+
+
+def of_particles(points: Points) -> Figures:
+    """Return the figures of particles."""
+    arrays, z_mm = points.arrays, points.position_mm[:, 2]
+    figures: Figures = {"places": partial(of_points.places_figure, points.position_mm, arrays["intensity"])}
     if len(z_mm):
         spread = arrays["covariance_mm2"]
         figures["depths"] = partial(of_points.depths_figure, z_mm, arrays["intensity"], spread)
@@ -136,8 +164,8 @@ def _of_particles(path: Path, raw: Path | None) -> Figures:
     return figures
 
 
-def _of_tracks(path: Path) -> Figures:
-    tracks = read_points(path, TRACKS_FORMAT)
+def of_tracks(tracks: Points) -> Figures:
+    """Return the figures of tracks of two frames."""
     arrays = tracks.arrays
     lines, stretch = of_points.displacement_lines(tracks.position_mm, arrays["displacement_mm"])
     longer = f"drawn {written(stretch)} times as long"
@@ -147,8 +175,8 @@ def _of_tracks(path: Path) -> Figures:
     return {"space": Drawn(caption, space)} | _of_all_tracks(tracks)
 
 
-def _of_trajectories(path: Path) -> Figures:
-    tracks = read_points(path, TRAJECTORIES_FORMAT)
+def of_trajectories(tracks: Points) -> Figures:
+    """Return the figures of tracks through a sequence."""
     track = tracks.arrays["track"]
     lines = of_points.trajectory_lines(tracks.position_mm, track)
     speeds = of_points.trajectory_lines(np.linalg.norm(tracks.arrays["velocity"], axis=1), track)
@@ -174,25 +202,30 @@ def _of_all_tracks(tracks: Points) -> Figures:
     return figures
 
 
-def _of_volume(path: Path) -> Figures:
-    volume = vtkhdf.open_volume(path)
+def of_volume(volume: vtkhdf.Volume) -> Figures:
+    """Return the figures of a volume."""
     return {
-        "projections": partial(of_vectors.projections_figure, volume.array, volume.grid),
-        "depths": partial(of_vectors.depths_figure, volume.array, volume.grid),
+        "projections": partial(vectors.projections_figure, volume.array, volume.grid),
+        "depths": partial(vectors.depths_figure, volume.array, volume.grid),
     }
 
 
-def _of_calibration(path: Path, white: Path | None) -> Figures:
+def of_calibration(calibration: Calibration) -> Figures:
+    """Return the figures of a calibration."""
+    return {"summary": partial(pictures.summary_figure, calibration)}
+
+
+def _of_calibration_in(path: Path, white: Path | None) -> Figures:
     calibration = open_calibration(path)
-    figures: Figures = {"summary": partial(of_calibration.summary_figure, calibration)}
+    figures = of_calibration(calibration)
     if white is not None:
         image = read_single(white, calibration.image_shape)
-        figures["lattice"] = partial(of_calibration.calibration_figure, calibration, image)
+        figures["lattice"] = partial(pictures.calibration_figure, calibration, image)
     return figures
 
 
-def _of_weights(path: Path) -> Figures:
-    content = open_weights(path)
+def of_weights(content: WeightsFile) -> Figures:
+    """Return the figures of weights."""
     nx, ny, nz = content.weights.grid.shape_xyz
     middle = partial(column_of, content, (nx // 2, ny // 2, nz // 2))
     column = Drawn("The pixels that the middle voxel lights: its point-spread function.", middle)
@@ -208,7 +241,7 @@ def column_of(content: WeightsFile, voxel: tuple[int, int, int]) -> Figure:
     grid = content.reference.grid_from_focal_point(content.weights.grid)
     place = ", ".join(written(axis, 4) for axis in grid.voxel_to_mm(np.array(voxel, dtype=np.float64)))
     title = f"voxel {ix}, {iy}, {iz} at ({place}) mm: {shares.size} pixels, sum {shares.sum():.4f}"
-    return of_vectors.column_figure((rows, columns), shares, content.camera.pixel_mm, title)
+    return vectors.column_figure((rows, columns), shares, content.camera.pixel_mm, title)
 
 
 def _light_of(content: WeightsFile) -> Figure:
@@ -221,22 +254,20 @@ def _light_of(content: WeightsFile) -> Figure:
         name: np.array([float(content.weights.column(int(iz), iy, ix)[2].sum()) for iz in planes])
         for name, (ix, iy) in places.items()
     }
-    return of_vectors.light_figure(grid.axis_mm(2)[planes], sums)
+    return vectors.light_figure(grid.axis_mm(2)[planes], sums)
 
 
 READERS: dict[str, Callable[[Path], Figures]] = {
-    vtkhdf.VECTORS_FORMAT: _of_vectors,
-    vtkhdf.VOLUME_FORMAT: _of_volume,
-    TRACKS_FORMAT: _of_tracks,
-    TRAJECTORIES_FORMAT: _of_trajectories,
-    weights_file.FORMAT: _of_weights,
+    vtkhdf.VECTORS_FORMAT: _of_vectors_in,
+    vtkhdf.VOLUME_FORMAT: lambda path: of_volume(vtkhdf.open_volume(path)),
+    TRACKS_FORMAT: lambda path: of_tracks(open_tracks(path)),
+    TRAJECTORIES_FORMAT: lambda path: of_trajectories(open_tracks(path)),
+    weights_file.FORMAT: lambda path: of_weights(open_weights(path)),
 }
 ON_IMAGES: dict[str, Callable[[Path, Path | None], Figures]] = {
-    PARTICLES_FORMAT: _of_particles,
-    calibration_file.FORMAT: _of_calibration,
+    PARTICLES_FORMAT: _of_particles_in,
+    calibration_file.FORMAT: _of_calibration_in,
 }
-
-__all__ = ["Drawn", "PlotOptions", "figures_of", "plot"]
 
 SUFFIXES = (".png", ".pdf")
 
@@ -270,7 +301,12 @@ def figures_of(path: Path, raw: Path | None = None) -> dict[str, Drawn]:
     if raw is not None and of_format not in ON_IMAGES:
         raise UsageError(f"--raw: figures of {of_format} show no image, only {' and '.join(ON_IMAGES)} do")
     found = ON_IMAGES[of_format](path, raw) if of_format in ON_IMAGES else READERS[of_format](path)
-    return {name: each if isinstance(each, Drawn) else Drawn(caption_of(each), each) for name, each in found.items()}
+    return with_captions(found)
+
+
+def with_captions(figures: Figures) -> dict[str, Drawn]:
+    """Return figures with what they show, where this is said by what draws them."""
+    return {name: each if isinstance(each, Drawn) else Drawn(caption_of(each), each) for name, each in figures.items()}
 
 
 def plot(

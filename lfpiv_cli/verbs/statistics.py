@@ -74,13 +74,6 @@ def _write(
     path: Path, found: FlowStatistics, like: Path, made: Mapping[str, Any], extra: Extra, *, overwrite: bool
 ) -> None:
     """Write statistics as vectors with more arrays; the origin of their coordinates is that of a file like them."""
-    attributes: dict[str, Any] = {
-        "pairs": found.pairs,
-        "integral_time_pairs": 0.5 * found.found.tau,
-        "block_pairs": found.found.block,
-    }
-    if found.profile is not None:
-        attributes |= {"profile": found.profile.name, "profile_components": ", ".join(found.profile.components)}
     vtkhdf.write_vectors(
         path,
         found.mean,
@@ -88,8 +81,8 @@ def _write(
         provenance=made,
         overwrite=overwrite,
         extra=found.arrays() | extra,
-        attributes=attributes,
-        tables=found.tables() if found.mean.dt_s is not None else {},
+        attributes=found.attributes(),
+        tables=found.tables(),
     )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any, Generic, TypeVar
 
@@ -19,6 +19,7 @@ from lfpiv_cli.flow.field import MM_TO_M, VectorField
 from lfpiv_cli.flow.windows import Walls
 from lfpiv_cli.grid import Reference, Scale
 from lfpiv_cli.notice import warn_of
+from lfpiv_cli.results import ArrayResult
 from lfpiv_cli.tracks.candidates import Light, Seen, Trajectories, long_ones
 from lfpiv_cli.tracks.in_time import Scatter
 from lfpiv_cli.tracks.sequences import SHORTEST, follow, scatter_in, states_at
@@ -174,7 +175,7 @@ class Tracking:
 Rows = TypeVar("Rows", bound=PointRows)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class TracksOf(Generic[Rows]):
     """Tracks, in memory or not, and what is told of them.
 
@@ -201,10 +202,12 @@ class TracksOf(Generic[Rows]):
         """Yield what `vectors` returns, one at a time."""
         settings = self.settings
         windows = windows_of(settings, settings.masking_walls())
-        return (vectors_from_paths(paths, windows, settings.correlation.dt_s) for paths in self.paths())
+        for paths in self.paths():
+            found = vectors_from_paths(paths, windows, settings.correlation.dt_s)
+            yield replace(found, reference=self.points.reference, provenance=self.points.provenance)
 
 
-class Tracked(TracksOf[Points]):
+class Tracked(ArrayResult, TracksOf[Points]):
     """Tracks in memory."""
 
 

@@ -6,6 +6,7 @@ import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -19,19 +20,24 @@ from lfpiv_cli.files.particle_file import (
     POSITION,
     TRACKS_FORMAT,
     TRAJECTORIES_FORMAT,
+    Points,
     read_points,
     units_of,
 )
 from lfpiv_cli.files.vtkhdf import (
+    FLAG_MEANINGS,
     VECTORS_FORMAT,
     VOLUME_FORMAT,
+    Volume,
+    arrays_of,
+    attributes_of,
     grid_in,
     open_vectors,
     open_volume,
     read_extra,
     read_root,
 )
-from lfpiv_cli.flow.field import REJECTED
+from lfpiv_cli.flow.field import REJECTED, VectorField
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.names import ExportFormat
 
@@ -49,6 +55,32 @@ OF_POINTS = (PARTICLES_FORMAT, TRACKS_FORMAT, TRAJECTORIES_FORMAT)
 COMPONENTS = {3: ("x", "y", "z"), 6: ("xx", "yy", "zz", "xy", "yz", "xz")}
 # What the components of these arrays are called; those of others have their name before them.
 NAMES = {POSITION: ["x", "y", "z"], "velocity": ["u", "v", "w"]}
+# What arrays hold whose names do not say it.
+DESCRIPTIONS = {
+    POSITION: "place",
+    "intensity": "light",
+    "covariance_mm2": "covariance of the place",
+    "chi2": "residual squared over its variance, about 1 where all light is explained",
+    "seen": "share of the light that meets the sensor",
+    "displacement_mm": "displacement from the first frame to the second",
+    "displacement_covariance_mm2": "covariance of the displacement",
+    "particle_a": "row of the particle in the first frame",
+    "particle_b": "row of the particle in the second frame",
+    "particle": "row of the particle in its frame",
+    "link_probability": "probability that the link is right",
+    "displacement_voxel": "displacement between the volumes",
+    "displacement_raw_voxel": "displacement before validation",
+    "correlation": "normalised correlation at the peak",
+    "peak_ratio": "highest peak over the second",
+    "valid_fraction": "share of the window inside volumes and mask",
+    "flag": FLAG_MEANINGS,
+    "uncertainty_voxel": "standard deviation of the displacement",
+    **{f"gradient_{name}": f"gradient of {name} along x, y, z" for name in "uvw"},
+    "samples": "vectors or tracks that the moments are of",
+    "share_a": "weight of the first field",
+    "disagreement": "how many standard errors the two fields are apart",
+}
+OUTSIDE = "1 outside the volume"
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,6 +104,18 @@ class Content:
     attributes: dict[str, Any]
     provenance: dict[str, Any]
 
+    def components(self, name: str) -> tuple[str, ...]:
+        """Return what the components of an array are called; none where it has one value at each place."""
+        array = self.arrays[name]
+        if array.ndim == (1 if self.grid is None else 3):
+            return ()
+        return COMPONENTS.get(array.shape[-1], tuple(map(str, range(array.shape[-1]))))
+
+    def descriptions(self) -> dict[str, str]:
+        """Return what each array holds, for people."""
+        other = {"flag": OUTSIDE} if self.format_name == PARTICLES_FORMAT else {}
+        return {name: (DESCRIPTIONS | other).get(name, name.replace("_", " ")) for name in self.arrays}
+
     def reported(self) -> dict[str, Any]:
         """Return what is told besides the arrays: the format, the attributes, and the provenance as JSON."""
         known = {name: value for name, value in self.attributes.items() if value is not None}
@@ -94,10 +138,7 @@ def read_content(path: Path) -> Content:
     if name not in KINDS:
         raise InputError(f"{path}: holds {name}, expected {', '.join(KINDS)}")
     if name == VOLUME_FORMAT:
-        volume = open_volume(path)
-        return Content(
-            name, volume.grid, {"intensity": volume.array}, {"intensity": "1"}, volume.attributes, volume.provenance
-        )
+        return content_of(open_volume(path))
     if name == VECTORS_FORMAT:
         open_vectors(path)  # for its checks
         found, _ = read_extra(path)
@@ -107,10 +148,28 @@ def read_content(path: Path) -> Content:
             grid, root = grid_in(file), read_root(file)
             units = {each: file[each].attrs["units"].decode() for each in arrays}
         return Content(name, grid, arrays, units, root.attributes, root.provenance)
-    points = read_points(path, name)
-    arrays = {POSITION: points.position_mm, **points.arrays}
-    units = {POSITION: "mm", **units_of(name, arrays)}
-    return Content(name, None, arrays, units, points.attributes, points.provenance)
+    return content_of(read_points(path, name))
+
+
+def content_of(
+    result: Volume | Points | VectorField,
+    extra: Mapping[str, tuple[NDArray[Any], str]] = MappingProxyType({}),
+    attributes: Mapping[str, Any] = MappingProxyType({}),
+) -> Content:
+    """Return what the file of a result holds; of vectors with arrays (units second) and attributes besides."""
+    if isinstance(result, VectorField):
+        both = arrays_of(result) | dict(extra)
+        arrays = {name: array for name, (array, _) in both.items()}
+        units = {name: unit for name, (_, unit) in both.items()}
+        said = result.reference.attributes() | attributes_of(result) | dict(attributes)
+        said = {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in said.items()}
+        return Content(VECTORS_FORMAT, result.grid, arrays, units, said, result.provenance)
+    said = result.reference.attributes() | result.attributes
+    if isinstance(result, Points):
+        arrays = {POSITION: result.position_mm, **result.arrays}
+        units = {POSITION: "mm", **units_of(result.format_name, arrays)}
+        return Content(result.format_name, None, arrays, units, said, result.provenance)
+    return Content(VOLUME_FORMAT, result.grid, {"intensity": result.array}, {"intensity": "1"}, said, result.provenance)
 
 
 def columns_of(content: Content) -> tuple[dict[str, NDArray[Any]], dict[str, str]]:
@@ -124,12 +183,10 @@ def columns_of(content: Content) -> tuple[dict[str, NDArray[Any]], dict[str, str
         centres = content.grid.centres_mm().reshape(-1, 3)
         columns = {axis: centres[:, k] for k, axis in enumerate("xyz")}
         units = dict.fromkeys("xyz", "mm")
-    places = 1 if content.grid is None else 3
     for name, array in content.arrays.items():
         names = [name]
-        if array.ndim > places:
-            count = array.shape[-1]
-            names = NAMES.get(name, [f"{name}_{suffix}" for suffix in COMPONENTS.get(count, range(count))])
+        if components := content.components(name):
+            names = NAMES.get(name, [f"{name}_{suffix}" for suffix in components])
         columns |= dict(zip(names, array.reshape(-1, len(names)).T, strict=True))
         units |= dict.fromkeys(names, content.units[name])
     return columns, units

@@ -202,8 +202,7 @@ def write_series(
     times, unit = (list(map(float, range(count))), "frame") if times_s is None else (times_s, "s")
 
     with created(path, overwrite=overwrite) as file:
-        reported = {name: np.asarray(value) if isinstance(value, list) else value for name, value in others.items()}
-        write_root(file, SERIES_FORMAT, SERIES_VERSION, reference, reported, provenance)
+        write_root(file, SERIES_FORMAT, SERIES_VERSION, reference, others, provenance)
         vtk = create_vtk_group(file, grid)
         points = vtk.create_group("PointData")
         for name, array in first.arrays.items():
