@@ -74,7 +74,7 @@ SUFFIXES = (".h5", ".vtkhdf")
 # Folders below the one that is given: of volumes, of particles, of a batch's vectors.
 DEEPEST = 2
 # Tables of vectors end here, and others.
-LONGEST_TABLE, LONGEST_OTHER = 60, 12
+LONGEST_TABLE, LONGEST_OTHER, LONGEST_INPUTS = 60, 8, 12
 # So many files of vectors are read, and so many reasons of one kind are told.
 MOST_FIELDS, MOST_REASONS = 1000, 3
 # Commands, by their records, whose vectors are made of others that stand beside them.
@@ -607,9 +607,9 @@ def _records(contents: Contents) -> Iterable[Section]:
         (*given, f"{first} and {len(others)} more" if others else first) for given, (first, *others) in used.items()
     ]
     libraries = ", ".join(f"{name} {version}" for name, version in last.get("libraries", {}).items())
-    left = f" The first {LONGEST_OTHER} of {len(rows)} inputs; info tells those of a file."
-    text = f"lfpiv {last.get('version')}; {libraries}.{left if len(rows) > LONGEST_OTHER else ''}"
-    table = Table("Made from", ("input", "SHA-256 begins", "for"), tuple(rows[:LONGEST_OTHER]))
+    left = f" The first {LONGEST_INPUTS} of {len(rows)} inputs; info tells those of a file."
+    text = f"lfpiv {last.get('version')}; {libraries}.{left if len(rows) > LONGEST_INPUTS else ''}"
+    table = Table("Made from", ("input", "SHA-256 begins", "for"), tuple(rows[:LONGEST_INPUTS]))
     yield Section("Provenance", "provenance", (text,), tables=(table,))
 
 
