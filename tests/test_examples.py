@@ -6,6 +6,7 @@ Snakemake, where it is installed. Of the image's definition the commands are run
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import shlex
@@ -33,7 +34,7 @@ SMALL = (
 LFPIV = f"""#!/bin/sh
 exec {shlex.quote(sys.executable)} -m lfpiv_cli "$@"
 """
-# Runs an array's jobs, each with what Slurm tells it, or one job in the background.
+# Runs an array's jobs, each with what Slurm tells it, one job after them, or one in the background.
 SBATCH = """#!/bin/bash
 if [[ $1 == --array=* ]]; then
     range=${1#--array=}; shift; first=${range%-*}; last=${range#*-}
@@ -41,6 +42,8 @@ if [[ $1 == --array=* ]]; then
         SLURM_ARRAY_JOB_ID=7 SLURM_ARRAY_TASK_ID=$task SLURM_ARRAY_TASK_MIN=$first SLURM_ARRAY_TASK_MAX=$last \\
             SLURM_ARRAY_TASK_COUNT=$((last - first + 1)) SLURM_ARRAY_TASK_STEP=1 SLURM_CPUS_PER_TASK=1 bash "$@" || exit
     done
+elif [[ $1 == --dependency=singleton ]]; then
+    shift; SLURM_JOB_ID=8 SLURM_CPUS_PER_TASK=1 bash "$@" || exit
 else
     bash "$@" >> "$STANDINS/jobs.out" 2>&1 &
     echo $! >> "$STANDINS/jobs"
@@ -119,16 +122,24 @@ def test_the_documents_name_every_example() -> None:
 
 @pytest.mark.slow
 def test_an_array_of_jobs_and_one_that_stops_early(experiment: Path) -> None:
-    job = shlex.quote(str(EXAMPLES / "array.sbatch"))
-    run(f"sbatch --array=1-3 {job} weights.h5 run volumes", experiment)
-    assert results(experiment / "volumes") == VOLUMES
+    job, given = shlex.quote(str(EXAMPLES / "array.sbatch")), "rig.yaml photographs run results --method volumes"
+    (experiment / "photographs").mkdir()
+    for name in ("white.tif", "dark.tif", "board.tif"):
+        shutil.copyfile(SAMPLE / name, experiment / "photographs" / name)
+    run(f"sbatch --array=1-2 {job} {given}", experiment)
+    assert results(experiment / "results" / "vectors") == ["1_a.vtkhdf", "2_a.vtkhdf"]
+    assert not (experiment / "results" / "report.html").exists()
+    run(f"sbatch --dependency=singleton {job} {given}", experiment)
+    assert (experiment / "results" / "report.html").exists()
+    assert json.loads((experiment / "results" / "run.json").read_text())["figures"]["vectors"]["volumes"] > 0
     assert not (experiment.parent / "standins" / "requeued").exists()
     # A job that stops early is queued again.
     job = (EXAMPLES / "array.sbatch").read_text()
     assert "--time-limit 01:55:00" in job
     script(experiment, "short.sbatch", job.replace("--time-limit 01:55:00", "--time-limit 0.001s"))
-    run("sbatch --array=1-2 short.sbatch weights.h5 run volumes", experiment)
-    assert (experiment.parent / "standins" / "requeued").read_text() == "requeue 7_1\nrequeue 7_2\n"
+    run(f"sbatch --array=1-2 short.sbatch {given}", experiment)
+    run(f"sbatch --dependency=singleton short.sbatch {given}", experiment)
+    assert (experiment.parent / "standins" / "requeued").read_text() == "requeue 7_1\nrequeue 7_2\nrequeue 8\n"
 
 
 @pytest.mark.slow

@@ -74,6 +74,22 @@ def test_shards_together_give_what_one_command_gives(rig, whole, with_weights):
 
 
 @pytest.mark.thorough
+@pytest.mark.filterwarnings("ignore::ResourceWarning")
+def test_workers_of_a_scheduler_give_what_one_command_gives(
+    rig: Path, whole: Path, with_weights: Path, in_process: str
+) -> None:
+    run(rig, with_weights, "--dask", in_process, "--keep", "results")
+    assert data_of(with_weights) == {name: data for name, data in data_of(whole).items() if "volumes" not in name}
+    shutil.rmtree(with_weights / "vectors")
+    run(rig, with_weights, "--dask", in_process)
+    assert data_of(with_weights) == data_of(whole)
+    # frames that wait for those before them, and pairs that come one by one, are not divided
+    for words, options in (("frame to frame", ("--follow",)), ("as it comes", ("--watch", "--idle-s", 1))):
+        with pytest.raises(UsageError, match=f"--dask: .*{words}"):
+            lfpiv("run", rig / "rig.yaml", rig / "images", *PHOTOGRAPHS, "--dask", "local", *options, "-o", rig / "no")
+
+
+@pytest.mark.thorough
 def test_more_shards_than_pairs_and_without_volumes(rig: Path, whole: Path, with_weights: Path) -> None:
     for number in range(1, 6):
         run(rig, with_weights, "--shard", f"{number}/5", "--keep", "results")

@@ -323,7 +323,7 @@ def named_images(command: Callable[..., Any]) -> Callable[..., Any]:
     show_default="all",
     help="results: drop volumes, and particles of separate pairs, as soon as their vectors stand.",
 )
-@work_options
+@batch_options
 @click.option("--report/--no-report", default=True, help="Make OUTPUT/report.html, a page of all of it.")
 @watch_options("by Ctrl-C")
 @output_option("Folder for all that is made.")
@@ -351,6 +351,9 @@ def run() -> None:
     a third of its pairs, as a job of its own, that stops before the limit of the job:
              lfpiv run rig.yaml images --pairing ab --white white.tif --dark dark.tif --board board.tif \\
                  --shard 2/3 --time-limit 50m -o results
+    all of them by eight workers on this machine, or by those of a cluster's scheduler:
+             lfpiv run rig.yaml images --pairing ab --white white.tif --dark dark.tif --board board.tif \\
+                 --dask local:8 -o results
     at the camera, each pair as it is written: a line for it, and OUTPUT/latest.html for the browser:
              lfpiv run rig.yaml --watch images --white white.tif --dark dark.tif --board board.tif -o results
     """

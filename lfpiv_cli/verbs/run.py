@@ -263,6 +263,8 @@ def _ensure_settings(settings: Config, options: RunOptions) -> None:
         raise UsageError("--follow finds particles, but --method is volumes")
     if options.follow and options.shard != ALL:
         raise UsageError(SEQUENCE_IS_WHOLE)
+    if options.follow and options.dask:
+        raise UsageError("--dask: a sequence is followed from frame to frame, which workers cannot share")
     if options.follow and options.combine:
         raise UsageError("--follow gives tracks, and --combine needs vectors")
     if by_volumes and settings.reconstruction.solver == "particles":

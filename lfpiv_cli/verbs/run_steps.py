@@ -25,7 +25,7 @@ from lfpiv_cli.files.shares import Deadline, awaited
 from lfpiv_cli.names import FlowMethod, Kept, RunMethod
 from lfpiv_cli.verbs import correlate as correlating
 from lfpiv_cli.verbs import track as tracking
-from lfpiv_cli.verbs.batches import ALL, BatchOptions, Failure, Stamp, Worked, WorkOptions, stamp_of, work_through
+from lfpiv_cli.verbs.batches import ALL, BatchOptions, Failure, Stamp, Worked, stamp_of, work_through
 from lfpiv_cli.verbs.build_weights import BuildWeightsOptions, build_weights_file
 from lfpiv_cli.verbs.calibrate import CalibrateOptions, calibrate_snapshot
 from lfpiv_cli.verbs.combine import combine_vectors
@@ -171,7 +171,7 @@ def _recorded(path: Path) -> dict[str, Any] | None:
 
 
 @dataclass(frozen=True, kw_only=True)
-class RunOptions(PairOptions, ImageOptions, WorkOptions):
+class RunOptions(PairOptions, ImageOptions, BatchOptions):
     """What `run` is given besides the config; it resumes by itself.
 
     Attributes
@@ -184,8 +184,6 @@ class RunOptions(PairOptions, ImageOptions, WorkOptions):
     follow : find and track the particles of a time-resolved sequence together, as `follow_particles` does
     keep : `results`: volumes, and particles of separate pairs, are dropped as soon as their vectors stand
     report : make the page of all that the folder holds, too
-    watch : the images are folders that are still being filled; separate pairs are measured as they become complete
-    idle_s : such folders end when nothing in them has changed for so long
     """
 
     images: Sequence[Path]
@@ -198,7 +196,6 @@ class RunOptions(PairOptions, ImageOptions, WorkOptions):
     follow: bool = False
     keep: Kept = "all"
     report: bool = True
-    watch: bool = False
     idle_s: float = math.inf
 
 
@@ -208,6 +205,21 @@ VOLUMES, PARTICLES = ReconstructOptions(), ReconstructOptions(solver="particles"
 RESULTS: dict[FlowMethod, str] = {"volumes": "vectors", "particles": "tracks"}
 # The files of vectors by the numbers of their pairs.
 Vectors = dict[int, Path]
+
+
+def pairs_by(
+    method: FlowMethod,
+    options: Mapping[str, Any],
+    overwrite: bool,
+    files: Sequence[Path],
+    output: Path,
+    pairs: Pairs | None,
+    gone: Mapping[Path, Gone] | None = None,
+) -> Correlation | Tracks:
+    """Return the batch of pairs of volumes, or of particles."""
+    if method == "volumes":
+        return Correlation(files, output, CorrelateOptions(**options), overwrite, pairs, gone)
+    return Tracks(files, output, TrackOptions(grid=True, **options), overwrite, pairs, gone)
 
 
 class Chain:
@@ -305,9 +317,11 @@ class Chain:
         """Return the batch of the frames of this share, of weights as they are `to_come` if they change."""
         by_particles, kept = method == "particles", self.options.keep == "all" or not self.pairs.separate
         chosen = replace(PARTICLES, residual=kept) if by_particles else VOLUMES
+        # What is prepared here no other process has.
+        prepared = None if self.options.dask else self.prepared
         options = replace(chosen, **self._of_images, **self._resuming)
         given = (weights, self.options.images, self.steps.output / method, options, self.overwrite)
-        return Reconstruction(*given, self.pairs if by_particles else None, self.prepared, self.order, to_come)
+        return Reconstruction(*given, self.pairs if by_particles else None, prepared, self.order, to_come)
 
     def vectors_by(self, method: FlowMethod, weights: Path) -> Vectors:
         """Measure the flow by volumes or by particles; return the files of vectors, none where tracks are all."""
@@ -324,21 +338,11 @@ class Chain:
         """Return the batch of pairs, each from its images to its vectors or tracks, of so many bytes if known."""
         results = self.of_pairs(RESULTS[method])
         targets = [Target(path, dict, grid_paths(path, 1) if method == "particles" else ()) for path in results]
-        return PairByPair(found, partial(self._measured, method), self.pairs, targets, file_bytes)
+        return PairByPair(found, self._measured(method), self.pairs, targets, file_bytes)
 
-    def _measured(
-        self,
-        method: FlowMethod,
-        files: Sequence[Path],
-        output: Path,
-        pairs: Pairs | None,
-        gone: Mapping[Path, Gone] | None = None,
-    ) -> Correlation | Tracks:
-        """Return the batch of pairs of volumes, or of particles."""
-        dt_s, resuming = self.options.dt_s, self._resuming
-        if method == "volumes":
-            return Correlation(files, output, CorrelateOptions(dt_s=dt_s, **resuming), self.overwrite, pairs, gone)
-        return Tracks(files, output, TrackOptions(dt_s=dt_s, grid=True, **resuming), self.overwrite, pairs, gone)
+    def _measured(self, method: FlowMethod) -> Callable[..., Correlation | Tracks]:
+        """Return what makes the batch of pairs of volumes, or of particles, here or in another process."""
+        return partial(pairs_by, method, {"dt_s": self.options.dt_s, **self._resuming}, self.overwrite)
 
     def _worked(self, batch: Correlation | Tracks | Reconstruction) -> dict[str, Any]:
         """Work through a batch of which nothing fails; return what is told of it."""
@@ -373,7 +377,7 @@ class Chain:
             ours = replace(self.pairs, pairs=tuple((place[first], place[second]) for first, second in pairs))
 
             def make() -> dict[str, Any]:
-                return self._worked(self._measured(method, [files[k] for k in place], output, ours))
+                return self._worked(self._measured(method)([files[k] for k in place], output, ours))
 
         made = [path for number in numbers for path in dict.fromkeys((paths[number], vectors[number]))]
         self._take(name, made, make)
@@ -392,7 +396,7 @@ class Chain:
             error = "a frame of the sequence is missing, and tracks would take those beside it for neighbours in time"
             self.failures.append(Failure(TRACKS, error))
             return {}
-        self._take("track", [tracks, *grids], lambda: self._worked(self._measured("particles", found, tracks, None)))
+        self._take("track", [tracks, *grids], lambda: self._worked(self._measured("particles")(found, tracks, None)))
         return dict(enumerate(grids))
 
     def following(self, dry_run: bool = False) -> FollowOptions:
@@ -402,7 +406,7 @@ class Chain:
 
     def batch_options(self, shared: bool) -> BatchOptions:
         """Return the options of a batch, `shared` where it is one of all pairs."""
-        return BatchOptions(**self._resuming, shard=self.options.shard if shared else ALL)
+        return BatchOptions(**self._resuming, shard=self.options.shard if shared else ALL, dask=self.options.dask)
 
     def _reconstructed(self, method: FlowMethod, weights: Path) -> tuple[list[Path], set[str]]:
         """Reconstruct all frames into a folder; return the files, and the names of frames that failed."""

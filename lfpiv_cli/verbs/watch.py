@@ -62,6 +62,8 @@ def watch(
     options.ensure_one_by_one()
     if options.follow or options.pairing == "sequence":
         raise UsageError("--watch measures separate pairs (--pairing ab); run a sequence when all of it is there")
+    if options.dask:
+        raise UsageError("--dask: a pair is measured as it comes, one at a time; with --watch leave it out")
     options = replace(options, keep_going=True, pairing=options.pairing if options.are_told else "ab")
     ensure_inputs(settings, replace(options, images=()))
     come = watched(options.images, "images", options, options.idle_s, console)
