@@ -139,6 +139,8 @@ def hardened(rig: DrawnRig, seed: int) -> DrawnRig:
         turn = rng.uniform(0.0, 2.0 * np.pi)
         moved = np.array([across * np.cos(turn), across * np.sin(turn), along * rng.choice([-1.0, 1.0])])
         scene["flow"]["velocity_m_s"] = moved.round(6).tolist()
+        for tree in (true, reported):
+            _deepen(tree, along * DT_S * 1e3)
     if "outside" in hard:
         size = reported["volume"]["size_mm"]
         size[2] = round(size[2] * float(rng.uniform(*SHALLOW)), 4)
@@ -255,6 +257,14 @@ def _place_behind_a_wall(true: Tree, depth: float, wall: float, to_focus: float,
     media = true["media"]
     distance = to_focus - 0.5 * depth / media["fluid"] - wall / media["window"]
     true["window"] = {"distance_mm": round(distance, 4), "thickness_mm": round(wall, 4)}
+
+
+def _deepen(tree: Tree, by_mm: float) -> None:
+    """Let the fluid reach further, half of it to the front, so that tracers that move by so much meet no wall."""
+    if "channel" in tree:
+        tree["channel"]["width_mm"] = round(tree["channel"]["width_mm"] + by_mm, 4)
+    if "window" in tree:
+        tree["window"]["distance_mm"] = round(tree["window"]["distance_mm"] - 0.5 * by_mm / tree["media"]["fluid"], 4)
 
 
 def _scene(

@@ -22,7 +22,7 @@ from benchmarks.depth import CAMERA, LATERAL_MM, Case, response
 from benchmarks.faults import FAULTS, STAGES, Bench, Experiment, benches, prepare, told_by
 from benchmarks.fuzz import READERS, Reader, bench_fuzz, case, meant, outcome
 from benchmarks.particles import calibrated, errors_over_bound, print_errors_over_bound, print_figures
-from benchmarks.rig_drawing import draw, hardened
+from benchmarks.rig_drawing import DT_S, draw, hardened
 from benchmarks.rigs import ADVICE, Outcome, Step, codes, row, run_rig, summary, verdict
 from benchmarks.sequences import print_sequence
 from benchmarks.solvers import SparseOperator, against_sparse_matrix, catching_up
@@ -206,6 +206,17 @@ def test_configs_of_drawn_rigs_are_accepted(number: int, tmp_path: Path) -> None
         path.write_text(json.dumps(tree))
         load_rig(path)
     assert (rig.reported == {key: value for key, value in rig.true.items() if key != "simulation"}) == (rig.wrong == "")
+
+
+def test_no_tracer_meets_a_wall_between_the_images() -> None:
+    drawn = (draw(SEED, number) for number in range(40))
+    rigs = [rig.true for each in drawn for rig in (each, hardened(each, SEED)) if "channel" in rig.true]
+    for true in rigs:
+        flow, half = true["simulation"]["flow"], 0.5 * np.array(true["volume"]["size_mm"])
+        turn = flow.get("angular_velocity_rad_s", (0.0, 0.0))[1]
+        moved = 1e3 * DT_S * abs(flow["velocity_m_s"][2]) + DT_S * abs(turn) * half[0]
+        assert half[2] + 0.5 * moved < 0.5 * true["channel"]["width_mm"] + 1e-3
+    assert len(rigs) > 30
 
 
 def outcome_of(figures: dict[str, float], *steps: Step) -> Outcome:
