@@ -46,6 +46,7 @@ from lfpiv_cli.errors import LfpivError
 from lfpiv_cli.files.config import load_rig
 from lfpiv_cli.files.images import read_image, write_tiff
 from lfpiv_cli.synthetic.render import render_white
+from lfpiv_cli.synthetic.scenes import RecordingCamera
 from lfpiv_cli.verbs.simulate import readout_of, real_camera
 
 RIGS, SEED = 40, 20261122
@@ -227,12 +228,12 @@ def codes(steps: Sequence[Step]) -> list[str]:
 def photograph_white(config: Path, images: Path) -> None:
     """Write a white and a dark image, as `simulate white` does in ten times as long."""
     settings = load_rig(config)
-    camera, readout = real_camera(settings), readout_of(settings)
+    camera = RecordingCamera(real_camera(settings), readout_of(settings))
     rng = np.random.default_rng([settings.simulation.seed, 0])
-    light = render_white(camera, settings.simulation.peak_counts, WHITE_SAMPLES)
+    light = render_white(camera.optics, settings.simulation.peak_counts, WHITE_SAMPLES)
     images.mkdir(exist_ok=True)
-    write_tiff(images / "white.tif", readout.record(light, rng), overwrite=True)
-    write_tiff(images / "dark.tif", readout.record(np.zeros_like(light), rng), overwrite=True)
+    write_tiff(images / "white.tif", camera.record(light, rng), overwrite=True)
+    write_tiff(images / "dark.tif", camera.dark_frame(rng), overwrite=True)
 
 
 def veil(images: Path, rig: DrawnRig) -> None:

@@ -31,6 +31,7 @@ from benchmarks.volumes import Seeding, volume_pair
 from benchmarks.weights import sparse_matrix
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.files.config import load_rig
+from lfpiv_cli.files.images import read_image
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media
@@ -217,6 +218,18 @@ def test_no_tracer_meets_a_wall_between_the_images() -> None:
         moved = 1e3 * DT_S * abs(flow["velocity_m_s"][2]) + DT_S * abs(turn) * half[0]
         assert half[2] + 0.5 * moved < 0.5 * true["channel"]["width_mm"] + 1e-3
     assert len(rigs) > 30
+
+
+def test_the_white_image_has_the_falloff_of_board_and_frames(tmp_path: Path) -> None:
+    true = draw(SEED, 3, (8, 6)).true
+    true["simulation"]["objective"] = {"falloff": 0.5}
+    path = tmp_path / "true.yaml"
+    path.write_text(json.dumps(true))
+    rigs.photograph_white(path, tmp_path / "images")
+    white = read_image(tmp_path / "images" / "white.tif")
+    rows, columns = np.array(white.shape) // 8
+    corner, middle = (np.quantile(part, 0.9) for part in (white[:rows, :columns], white[3 * rows : -3 * rows]))
+    assert corner < 0.8 * middle
 
 
 def outcome_of(figures: dict[str, float], *steps: Step) -> Outcome:
