@@ -49,6 +49,8 @@ DT_S = 1e-3
 # along; the share of the lit depth that the owner takes for the volume.
 HARD_SHARE = 0.35
 DOT_LENSES, LEAST_SPACING_LENSES, BOARD_UNITS = (0.4, 3.0), 2.4, 3.0
+# Dots along a side: rendering each takes a fifth of a second, and more tell hardly more.
+MOST_DOTS = 8
 HAZE, FALLOFF, SHALLOW = (0.02, 0.5), (0.1, 0.6), (0.6, 0.9)
 REACH_LENSES, REACH_UNITS = (2.0, 15.0), (0.3, 1.2)
 # What one owner in five has wrong, and by how much.
@@ -125,7 +127,7 @@ def hardened(rig: DrawnRig, seed: int) -> DrawnRig:
         field = sides * camera["sensor"]["pixel_um"] * 1e-3 / array["pitch_mm"] * lens_mm
         diameter = lens_mm * _log_uniform(rng, *DOT_LENSES)
         spacing = max(diameter * rng.uniform(3.5, 5.0), LEAST_SPACING_LENSES * lens_mm)
-        dots = np.clip(np.floor(field / spacing), 3, 15).astype(int).tolist()
+        dots = np.clip(np.floor(field / spacing), 3, MOST_DOTS).astype(int).tolist()
         lengths = {"dots": dots, "spacing_mm": round(spacing, 5), "dot_diameter_mm": round(diameter, 5)}
         for tree in (true, reported):
             tree["board"] |= lengths
