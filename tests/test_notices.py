@@ -394,6 +394,8 @@ def told_of(**measured: object) -> list[Notice]:
         ({"particles_per_lens": 1.2, "tracers_per_lens": 1.29}, None, ""),
         ({"particles_per_lens": 1.2, "tracers_per_lens": 4.0}, "particles-crowded", "4 particles for each microlens, "),
         ({"particles_per_lens": 1.2, "tracers_per_lens": 4.0}, "particles-crowded", ", 1.2 found of 4"),
+        ({"beyond_depths": 0.02, "residual": 0.09}, None, ""),
+        ({"beyond_depths": 0.04}, "light-unexplained", "4% of the particles end at the first or last depth in which"),
         ({"depth_ambiguous": 0.24}, None, ""),
         ({"depth_ambiguous": 0.26}, "depth-ambiguous", "26% of the particles about as well, at most 25%"),
         ({"microlens_focus": 0.004, "microlens_focus_sigma": 0.0001}, None, ""),

@@ -31,7 +31,7 @@ from lfpiv_cli.particles.diameter import ENOUGH, UNKNOWN_LENSES, Diameter, diame
 from lfpiv_cli.particles.microlens_focus import FocalLength, focal_length_of
 from lfpiv_cli.particles.neighbour_frames import second_frame, second_pass
 from lfpiv_cli.particles.rounds import ROUNDS, first_pass
-from lfpiv_cli.particles.search import LAST_UNEXPLAINED, MUCH_LEFT, Particles, Task, result, task_of
+from lfpiv_cli.particles.search import LAST_UNEXPLAINED, MARGIN_DEPTHS, MUCH_LEFT, Particles, Task, result, task_of
 from lfpiv_cli.particles.view import Light, View, ensure_square_cells, raw_view
 from lfpiv_cli.reconstruction.haze import Haze
 from lfpiv_cli.reconstruction.images import Image, Mask, filled, light
@@ -53,8 +53,8 @@ from lfpiv_cli.weights.columns import OnDemandOperator
 
 # Frames that are looked at for the tracers' diameter, if the first do not hold enough.
 LOOKED_AT = 5
-# Depths beyond the volume in which particles are fitted, too, in depths over which light spreads by one lens.
-BEYOND_DEPTHS = 0.5
+# Depths beyond the volume for which light as waves is known, in depths over which light spreads by one lens.
+BEYOND_DEPTHS = MARGIN_DEPTHS + 0.2
 # Units of progress that `find`, `find_first` and `find_second` report.
 STEPS = sum(settings.iterations + 1 for settings in ROUNDS)
 
@@ -349,6 +349,7 @@ def points_of(bench: Bench, frame: Frame, found: Particles, size: TracerSize, pr
             ),
             "particles_per_lens": float(np.count_nonzero(inside)) / lenses,
             "depth_ambiguous": float(np.mean(found.ambiguous[inside])) if inside.any() else 0.0,
+            "beyond_depths": float(np.mean(found.beyond)) if inside.size else 0.0,
         }
         | ({} if haze is None else {"haze_counts": haze.level_counts})
         | ({} if number is None else {"tracers_per_lens": number})

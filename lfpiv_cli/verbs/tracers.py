@@ -22,6 +22,8 @@ LARGEST_UNEXPLAINED = 0.2
 LARGEST_CROWD = 1.4
 # Of tracers at all depths of a usual volume one in seven at most has another depth that fits about as well, in crowds.
 MOST_AMBIGUOUS = 0.25
+# Of tracers in a volume that holds all of them hardly one in a hundred is taken to lie outside its margin.
+MOST_BEYOND = 0.03
 # Microlenses whose focal length is off by a larger share are told: depths are off by some three stated errors for each
 # per cent. Good ones seem up to 0.002 off, and more the more light is left, and the more tracers there are for each
 # microlens from one on.
@@ -182,6 +184,18 @@ def light_notices(points: Points, name: str) -> list[Notice]:
                 "check the calibration (refine-calibration), particle_diameter_mm, --dark, --background and the volume",
                 unexplained,
                 f"at most {LARGEST_UNEXPLAINED:g}",
+            )
+        )
+    elif (beyond := measured.get("beyond_depths", 0.0)) > MOST_BEYOND:
+        notices.append(
+            Notice(
+                "light-unexplained",
+                name,
+                f"{beyond:.0%} of the particles end at the first or last depth in which they are sought, at most "
+                f"{MOST_BEYOND:.0%} of a good volume's: tracers from further away light the image",
+                "a deeper volume, or a thinner light sheet",
+                beyond,
+                f"at most {MOST_BEYOND:g}",
             )
         )
     elif unexplained > MUCH_LEFT:
