@@ -22,8 +22,9 @@ LARGEST_UNEXPLAINED = 0.2
 LARGEST_CROWD = 1.4
 # Of tracers at all depths of a usual volume one in seven at most has another depth that fits about as well, in crowds.
 MOST_AMBIGUOUS = 0.25
-# Of tracers in a volume that holds all of them hardly one in a hundred is taken to lie outside its margin.
-MOST_BEYOND = 0.03
+# Of tracers in a volume that holds all of them hardly one in a hundred is taken to lie outside its margin; of few one
+# or two are.
+MOST_BEYOND, FEWEST_BEYOND = 0.03, 2.5
 # Microlenses whose focal length is off by a larger share are told: depths are off by some three stated errors for each
 # per cent. Good ones seem up to 0.002 off, and more the more light is left, and the more tracers there are for each
 # microlens from one on.
@@ -186,7 +187,7 @@ def light_notices(points: Points, name: str) -> list[Notice]:
                 f"at most {LARGEST_UNEXPLAINED:g}",
             )
         )
-    elif (beyond := measured.get("beyond_depths", 0.0)) > MOST_BEYOND:
+    elif (beyond := measured.get("beyond_depths", 0.0)) > max(MOST_BEYOND, FEWEST_BEYOND / max(count, 1)):
         notices.append(
             Notice(
                 "light-unexplained",
