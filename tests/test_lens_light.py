@@ -170,6 +170,10 @@ def test_uniform_light_is_no_frame(images: LensImages, lattice: Lattice, table2:
     assert told == ["frame-uniform"]
     for share in (0.1, 0.9):
         assert not list(uniform_notices(images, fit, tracers(lattice, share=share), "a"))
+    # A tracer in haze.
+    hazy = 1000.0 * uniform(lattice) + noise
+    hazy[92:106, 110:124] *= 1.5
+    assert not list(uniform_notices(images, fit, hazy, "a"))
     assert not list(uniform_notices(images, sheet_fit(camera), 1000.0 * uniform(lattice) + noise, "a"))
 
 

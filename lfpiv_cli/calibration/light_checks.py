@@ -160,6 +160,8 @@ LARGE_RESIDUAL, LARGEST_RESIDUAL = 0.02, 0.06
 FEWEST_FOUND = 0.5
 # Nine in ten lens images of a white image differ less from the median of those around.
 LARGEST_DIFFERENCE, DIFFERENCE_PERCENTILE, NEIGHBOURS = 0.08, 90.0, 4
+# Of thousands the brightest differs by two to four times as much; tracers in haze are brighter than that.
+STANDING_OUT = 6.0
 # Of the brightest lens image: darker ones count as this bright, which is nothing.
 DARKEST = 1e-9
 # What the data sheet says of the lens images' width is believed to this factor.
@@ -214,7 +216,7 @@ def white_notices(white: Floats, fit: LatticeFit, width: float, sheet_width: flo
         )
         remedy = f"{IS_IT_WHITE}, and light the whole sensor"
         yield Notice("lattice-incomplete", WHITE, text, remedy, found, f"at least {FEWEST_FOUND:g}")
-    difference = neighbours_difference(white, fit)
+    difference, _ = neighbours_difference(white, fit)
     if difference > LARGEST_DIFFERENCE:
         text = (
             f"one lens image in ten differs by more than {100 * difference:.0f} % in brightness from those around it, "
@@ -266,16 +268,19 @@ def blur_notices(images: LensImages, white: NDArray[np.floating], camera: Camera
         yield Notice("white-blurred", WHITE, text, remedy, more, f"at most {LARGEST_BLUR_PX:g} px")
 
 
-def neighbours_difference(white: Floats, fit: LatticeFit) -> float:
-    """Return how much nine in ten lens images at most differ in brightness from the median of those around."""
+def neighbours_difference(white: Floats, fit: LatticeFit) -> tuple[float, float]:
+    """Return how much nine in ten lens images at most differ in brightness from the median of those around.
+
+    And how much brighter the one is that stands out most.
+    """
     half = max(1, int(MIDDLE_PER_PITCH * fit.lattice_px.pitch.mean()))
     level = uniform_filter(np.asarray(white, dtype=np.float64), 2 * half + 1)
     columns, rows = np.clip(np.round(fit.centres_px).astype(int), 0, np.array(white.shape[::-1]) - 1).T
     brightness = level[rows, columns]
     _, nearest = KDTree(fit.centres_px).query(fit.centres_px, NEIGHBOURS + 1)
     around = np.median(brightness[nearest[:, 1:]], axis=1)
-    relative = np.abs(brightness - around) / np.maximum(around, DARKEST * max(float(np.abs(brightness).max()), DARKEST))
-    return float(np.percentile(relative, DIFFERENCE_PERCENTILE))
+    relative = (brightness - around) / np.maximum(around, DARKEST * max(float(np.abs(brightness).max()), DARKEST))
+    return float(np.percentile(np.abs(relative), DIFFERENCE_PERCENTILE)), float(relative.max())
 
 
 # Lens images that have moved by less do no harm: a share of the pitch, and what pixels themselves make of small ones.
@@ -388,8 +393,8 @@ def uniform_notices(images: LensImages, fit: LatticeFit, picture: NDArray[np.flo
     # Few tracers leave most lens images dark, which takes less time to see.
     if not np.median(picture[row, column]) > level + LARGEST_OFFSET_SIGMAS * noise:
         return
-    difference = neighbours_difference(np.nan_to_num(picture), fit)
-    if difference < LARGEST_DIFFERENCE:
+    difference, most = neighbours_difference(np.nan_to_num(picture), fit)
+    if difference < LARGEST_DIFFERENCE and most < STANDING_OUT * difference:
         text = (
             f"nine in ten lens images differ by less than {100 * difference:.1f} % in brightness from those around, "
             "as under uniform light: it shows no tracers"
