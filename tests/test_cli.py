@@ -44,6 +44,10 @@ def groups_of(name: str) -> dict[str, list[str]]:
     return found
 
 
+# Options of a command beside those of all batches and of all commands: more are not read.
+MOST_OWN = 25
+
+
 @pytest.mark.parametrize("name", cli.list_commands(click.Context(cli)))
 def test_help_has_each_option_once_under_what_it_is_about(name: str) -> None:
     found = groups_of(name)
@@ -53,6 +57,8 @@ def test_help_has_each_option_once_under_what_it_is_about(name: str) -> None:
     assert sorted(listed) == sorted(option.opts[-1].removeprefix("--") for option in options)
     assert [title for title in GROUPS if title in found] == list(found)
     assert {"json", "quiet", "threads", "help"} <= set(found["What it prints, and on what it runs"])
+    *own, _, _ = (found.get(title, []) for title in GROUPS)
+    assert sum(map(len, own)) <= MOST_OWN
 
 
 def test_batches_have_one_heading_and_defaults_are_shown() -> None:
