@@ -18,6 +18,7 @@ from lfpiv_cli.optics.surfaces import Cylinder
 from lfpiv_cli.pictures import points as of_points
 from lfpiv_cli.pictures import vectors as of_volume
 from lfpiv_cli.pictures import vectors as pictures
+from lfpiv_cli.pictures.statistics import convergence_figure
 from lfpiv_cli.pictures.style import (
     COLOURS,
     DIVERGING,
@@ -370,3 +371,12 @@ def test_a_series_shows_the_means_of_pairs_in_their_order_with_sigma() -> None:
         band = panel.collections[0].get_paths()[0].get_extents()
         assert (band.y0, band.y1) == (mean[0, component] - 0.5, mean[-1, component] + 0.5)
     assert panels[-1].get_xlabel() == "pair, from a to d"
+
+
+def test_labels_of_convergence_are_those_of_decades_where_there_are_several() -> None:
+    pairs = np.array([2, 8, 32])
+    scatter = pairs[:, None] ** -0.5 * np.array([1.0, 0.1, 0.001])
+    for spread, labelled in ((scatter, False), (scatter[:, [0, 0, 0]], True)):
+        figure = convergence_figure(pairs, spread, np.hstack([spread, spread]))
+        figure.draw_without_rendering()
+        assert any(each.get_text() for each in figure.axes[0].yaxis.get_minorticklabels()) == labelled

@@ -92,6 +92,9 @@ def profile_figure(along: str, components: Sequence[str], arrays: Arrays) -> sty
     return figure
 
 
+DECADE = 10.0
+
+
 @style.styled
 def convergence_figure(pairs: Integers, velocity: Floats, stress: Floats) -> style.Figure:
     """Convergence: by how much means and stresses of so many pairs scatter, rms over all places; of all pairs, the
@@ -117,6 +120,8 @@ def convergence_figure(pairs: Integers, velocity: Floats, stress: Floats) -> sty
         panel.set(xlabel="pairs", ylabel=label, xscale="log", yscale="log", xticks=pairs, xticklabels=pairs)
         panel.tick_params(axis="x", which="minor", bottom=False, labelbottom=False)
         panel.yaxis.set_major_formatter("{x:g}")
-        panel.yaxis.set_minor_formatter("{x:g}")
+        low, high = panel.get_ylim()
+        # Over several decades the labels between would lie on each other.
+        panel.yaxis.set_minor_formatter("{x:g}" if high < DECADE * low else "")
         panel.legend(ncols=2)
     return figure

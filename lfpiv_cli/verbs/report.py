@@ -203,6 +203,8 @@ def _sentence(contents: Contents, fields: Fields, faults: int) -> str:
         ours = [fields[path] for path in first]
         there = [field.flag < REJECTED for field in ours]
         pairs = f" of {len(first)} pairs" if len(first) > 1 else ""
+        if len(first) == 1 and "pairs" in (said := read_header(first[0]).attributes):
+            pairs = f", means of {said['pairs']} pairs,"
         number = f"{sum(map(np.count_nonzero, there)):,} vectors{pairs}"
         velocity = np.concatenate([field.velocity[known] for field, known in zip(ours, there, strict=True)])
         sigma = np.array([checks.velocity_of(field)[1] for field in ours])
