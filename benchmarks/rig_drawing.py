@@ -49,8 +49,8 @@ DT_S = 1e-3
 # along; the share of the lit depth that the owner takes for the volume.
 HARD_SHARE = 0.35
 DOT_LENSES, LEAST_SPACING_LENSES, BOARD_UNITS = (0.4, 3.0), 2.4, 3.0
-# Dots along a side: rendering each takes a fifth of a second, and more tell hardly more.
-MOST_DOTS = 8
+# Dots along a side that any board has in view, and of hard ones at most: rendering each takes a fifth of a second.
+LEAST_DOTS, MOST_DOTS = 3, 8
 HAZE, FALLOFF, SHALLOW = (0.02, 0.5), (0.1, 0.6), (0.6, 0.9)
 REACH_LENSES, REACH_UNITS = (2.0, 15.0), (0.3, 1.2)
 # What one owner in five has wrong, and by how much.
@@ -127,7 +127,8 @@ def hardened(rig: DrawnRig, seed: int) -> DrawnRig:
         field = sides * camera["sensor"]["pixel_um"] * 1e-3 / array["pitch_mm"] * lens_mm
         diameter = lens_mm * _log_uniform(rng, *DOT_LENSES)
         spacing = max(diameter * rng.uniform(3.5, 5.0), LEAST_SPACING_LENSES * lens_mm)
-        dots = np.clip(np.floor(field / spacing), 3, MOST_DOTS).astype(int).tolist()
+        spacing = min(spacing, float(field.min()) / LEAST_DOTS)
+        dots = np.clip(np.floor(field / spacing), LEAST_DOTS, MOST_DOTS).astype(int).tolist()
         lengths = {"dots": dots, "spacing_mm": round(spacing, 5), "dot_diameter_mm": round(diameter, 5)}
         for tree in (true, reported):
             tree["board"] |= lengths
@@ -239,8 +240,8 @@ def _camera(rng: np.random.Generator, lenses: tuple[int, int] | None) -> tuple[T
 def _board(rng: np.random.Generator, lens_mm: float, field: NDArray[np.float64]) -> Tree:
     """Return the section `board`: dots that the array resolves, on a board that nearly fills the view."""
     diameter = lens_mm * rng.uniform(1.5, 2.0)
-    spacing = diameter * rng.uniform(3.5, 5.0)
-    dots = np.clip(np.floor(field / spacing), 3, 9).astype(int)
+    spacing = min(diameter * rng.uniform(3.5, 5.0), float(field.min()) / LEAST_DOTS)
+    dots = np.clip(np.floor(field / spacing), LEAST_DOTS, 9).astype(int)
     return {
         "dots": dots.tolist(),
         "spacing_mm": round(float(spacing), 5),
