@@ -385,6 +385,13 @@ def told_of(**measured: object) -> list[Notice]:
     [
         ({"residual": 0.09}, None, ""),
         ({"residual": 0.11}, "light-model", "give reconstruction.wavelength_nm"),
+        ({"residual": 0.19, "residual_alike": 0.02}, None, ""),
+        ({"residual": 0.09, "residual_alike": 0.4}, None, ""),
+        (
+            {"residual": 0.09, "residual_alike": 0.6},
+            "light-model",
+            "60% of what is left is alike in pixels",
+        ),
         ({"residual": 0.19, "light": "waves"}, "light-model", "wavelength_nm and diffusion_px"),
         ({"residual": 0.21}, "light-unexplained", ""),
         ({"particles_per_lens": 0.0}, None, ""),

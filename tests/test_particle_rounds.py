@@ -22,6 +22,7 @@ from lfpiv_cli.particles.view import raw_view
 from lfpiv_cli.reconstruction.solvers import normalisers
 from lfpiv_cli.synthetic.render import Balls, render_points
 from lfpiv_cli.validation.volume import particle_figures
+from lfpiv_cli.verbs.tracers import MUCH_LEFT_ALIKE
 from lfpiv_cli.weights.build import default_padding, factorise, factorise_bricks
 from lfpiv_cli.weights.model import Weights
 from tests.particle_images import task_with
@@ -283,6 +284,27 @@ def test_tracers_beyond_the_volume_are_found_there_and_hurt_no_other(table2: Cam
     assert found.beyond.sum() <= 1
     assert min(figures["recall"], figures["precision"]) > 0.95
     assert figures["rms_z_voxel"] < 0.05
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("waves", [None, Waves(532e-6)])
+def test_what_another_physics_leaves_is_alike_in_pixels_side_by_side(
+    table2: Camera, water: Media, waves: Waves | None
+) -> None:
+    # By waves 0.065 to 0.11 of the light near the focal plane, 0.6 of its depths covered; by rays up to 0.05.
+    rng = np.random.default_rng(0)
+    camera = replace(table2, columns=240, rows=220)
+    weights = weights_of(camera, water, Grid.centred((10, 9, 16), (0.1, 0.1, 0.1), (0.0, 0.0, 0.0)))
+    view, sums, space = (
+        raw_view(camera, water, 0.025),
+        normalisers(weights.padded),
+        ObjectSpace(water, None, "paraxial"),
+    )
+    true, light = rng.uniform((-0.45, -0.4, -0.75), (0.45, 0.4, 0.75), (10, 3)), rng.uniform(3e5, 6e5, 10)
+    image = with_noise(render_points(camera, space, Balls(true, light, 0.05), rng, waves=waves, rays=100_000), rng)
+    found = find_particles(task_of(np.rint(image).astype(np.float32), view, weights, camera, sums))
+    left = np.linalg.norm(found.residual) / np.linalg.norm(image)
+    assert (left * np.sqrt(found.alike) > MUCH_LEFT_ALIKE) == (waves is not None)
 
 
 @pytest.mark.thorough

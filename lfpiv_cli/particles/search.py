@@ -118,6 +118,7 @@ class Particles:
     ambiguous : (n,) whether another depth explains its light about as well
     beyond : (n,) whether it ends at the first or last depth that it may have: it lies there or further out
     residual : (rows, columns) what the particles leave of the image, counts
+    alike : share of it that is alike in pixels side by side where particles light them, as noise is not
     noise : of the image
     """
 
@@ -130,6 +131,7 @@ class Particles:
     ambiguous: NDArray[np.bool_]
     beyond: NDArray[np.bool_]
     residual: Floats
+    alike: float
     noise: Noise
 
 
@@ -416,6 +418,7 @@ def result(task: Task, state: State) -> Particles:
         ambiguous=ambiguous,
         beyond=beyond,
         residual=state.residual.reshape(shape),
+        alike=correlation.share,
         noise=state.noise,
     )
 

@@ -12,11 +12,15 @@ from lfpiv_cli.files.particle_file import Points
 from lfpiv_cli.notice import Notice, written
 from lfpiv_cli.particles.diameter import LIMIT_SIGMAS
 from lfpiv_cli.particles.diffusion import USUAL_SIGMA_PX
-from lfpiv_cli.particles.search import MUCH_LEFT
+from lfpiv_cli.particles.search import MUCH_ALIKE, MUCH_LEFT
 from lfpiv_cli.verbs.frames import haze_notices
 
 # More than this share of an image's light, its noise taken off, is too much to leave unexplained.
 LARGEST_UNEXPLAINED = 0.2
+# Where more than this is left that is alike in pixels side by side, by the root of its share, the model of light is
+# wrong: fitted by rays, images by rays leave up to 0.05, crowded ones, those by waves 0.065 to 0.11, and near the focal
+# plane 0.65 to 0.7 of their depths are covered. Where hardly any is alike, what is left is noise.
+MUCH_LEFT_ALIKE, LEAST_ALIKE = 0.06, 0.05
 # At so many found for each microlens stated errors begin to cover less than .85: of 1.6 tracers as many are found, and
 # .88 to .94 covered; of 2, of which 1.5 to 1.8 are found, .6 to .7.
 LARGEST_CROWD = 1.4
@@ -175,6 +179,7 @@ def light_notices(points: Points, name: str) -> list[Notice]:
     noise_share = measured["read_noise_counts"] / max(measured["residual_rms_counts"], measured["read_noise_counts"])
     unexplained = measured["residual"] * float(np.sqrt(1.0 - min(noise_share, 1.0) ** 2))
     count, notices = len(points.position_mm), haze_notices(measured, name)
+    alike = measured.get("residual_alike", MUCH_ALIKE)
     if unexplained > LARGEST_UNEXPLAINED:
         notices.append(
             Notice(
@@ -199,13 +204,14 @@ def light_notices(points: Points, name: str) -> list[Notice]:
                 f"at most {MOST_BEYOND:g}",
             )
         )
-    elif unexplained > MUCH_LEFT:
+    elif (unexplained > MUCH_LEFT and alike > LEAST_ALIKE) or unexplained * np.sqrt(alike) > MUCH_LEFT_ALIKE:
         notices.append(
             Notice(
                 "light-model",
                 name,
-                f"{unexplained:.0%} of the light is not that of the particles found by {measured['light']}, at most "
-                f"{MUCH_LEFT:.0%} where the model is right and few are missing: stated errors may be too small",
+                f"{unexplained:.0%} of the light is not that of the particles found by {measured['light']}, and "
+                f"{alike:.0%} of what is left is alike in pixels side by side; at most {MUCH_LEFT:.0%} is left, or noise, "
+                "where the model is right and few are missing: stated errors may be too small",
                 "give reconstruction.wavelength_nm, as lenses diffract"
                 if measured["light"] == "rays"
                 else "check the calibration, wavelength_nm and diffusion_px",
