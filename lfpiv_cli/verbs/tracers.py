@@ -210,8 +210,8 @@ def light_notices(points: Points, name: str) -> list[Notice]:
                 "light-model",
                 name,
                 f"{unexplained:.0%} of the light is not that of the particles found by {measured['light']}, and "
-                f"{alike:.0%} of what is left is alike in pixels side by side; at most {MUCH_LEFT:.0%} is left, or noise, "
-                "where the model is right and few are missing: stated errors may be too small",
+                f"{alike:.0%} of what is left is alike in pixels side by side; at most {MUCH_LEFT:.0%} is left, or "
+                "noise, where the model is right and few are missing: stated errors may be too small",
                 "give reconstruction.wavelength_nm, as lenses diffract"
                 if measured["light"] == "rays"
                 else "check the calibration, wavelength_nm and diffusion_px",
