@@ -179,6 +179,10 @@ def light_notices(points: Points, name: str) -> list[Notice]:
     noise_share = measured["read_noise_counts"] / max(measured["residual_rms_counts"], measured["read_noise_counts"])
     unexplained = measured["residual"] * float(np.sqrt(1.0 - min(noise_share, 1.0) ** 2))
     count, notices = len(points.position_mm), haze_notices(measured, name)
+    found = measured["particles_per_lens"]
+    crowd = max(found, measured.get("tracers_per_lens", 0.0))
+    # Of crowds particles that are none end anywhere.
+    beyond = measured.get("beyond_depths", 0.0) if crowd <= LARGEST_CROWD else 0.0
     alike = measured.get("residual_alike", MUCH_ALIKE)
     if unexplained > LARGEST_UNEXPLAINED:
         notices.append(
@@ -192,7 +196,7 @@ def light_notices(points: Points, name: str) -> list[Notice]:
                 f"at most {LARGEST_UNEXPLAINED:g}",
             )
         )
-    elif (beyond := measured.get("beyond_depths", 0.0)) > max(MOST_BEYOND, FEWEST_BEYOND / max(count, 1)):
+    elif beyond > max(MOST_BEYOND, FEWEST_BEYOND / max(count, 1)):
         notices.append(
             Notice(
                 "light-unexplained",
@@ -219,8 +223,6 @@ def light_notices(points: Points, name: str) -> list[Notice]:
                 f"at most {MUCH_LEFT:g}",
             )
         )
-    found = measured["particles_per_lens"]
-    crowd = max(found, measured.get("tracers_per_lens", 0.0))
     if crowd > LARGEST_CROWD:
         counted = (
             f", {written(found)} found of {written(crowd)} by how unevenly they light them" if crowd > found else ""
