@@ -122,6 +122,16 @@ def test_answers_that_cannot_be_are_asked_again_and_a_magnification_is_negative(
         assert load_rig(path).sections.camera.main_lens.focal_length_mm == 105.0
 
 
+def test_an_index_that_cannot_be_is_asked_again_and_answers_that_end_are_told(tmp_path: Path) -> None:
+    path = tmp_path / "rig.yaml"
+    done = typed(8 * "\n" + "448\n1.4\n" + 9 * "\n", str(path))
+    assert done.exit_code == 0, done.output
+    assert "448: expected a refractive index, from 1 to 5" in done.stderr
+    assert load_rig(path).sections.media.fluid == 1.4
+    done = typed("\n\n", str(path), "--overwrite")
+    assert "the answers end before all is asked; --camera" in str(done.exception)
+
+
 # Magnification, focal length, pitch, microlenses, aperture, pixels, columns, rows, fluid, wall, its thickness, channel,
 # volume and velocity, in other units and as plain numbers.
 SPELLED = {

@@ -1,6 +1,7 @@
 """Figures of particles, tracks, volumes, weights and vector fields: what they show, where, on what scale."""
 
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -380,3 +381,14 @@ def test_labels_of_convergence_are_those_of_decades_where_there_are_several() ->
         figure = convergence_figure(pairs, spread, np.hstack([spread, spread]))
         figure.draw_without_rendering()
         assert any(each.get_text() for each in figure.axes[0].yaxis.get_minorticklabels()) == labelled
+
+
+def test_panels_of_a_deep_volume_have_room_for_their_numbers_and_bars() -> None:
+    grid = Grid.centred((5, 4, 12), (0.5, 0.5, 1.5), (0.0, 0.0, 0.0))
+    figure = pictures.compared_figure(grid, {"": np.ones((12, 4, 5, 3))}, "m/s")
+    figure.draw_without_rendering()
+    *_, narrow, bar = sorted(figure.axes, key=lambda axes: axes.get_position().x0)
+    shown = [each.get_window_extent() for each in narrow.get_xticklabels() if each.get_text()]
+    assert all(left.x1 < right.x0 for left, right in pairwise(shown))
+    assert narrow.title.get_window_extent().y1 < figure.bbox.height - 15
+    assert bar.get_window_extent().width > 0.1 * figure.dpi

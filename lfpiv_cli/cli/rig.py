@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -150,7 +151,12 @@ def init(
     target = output or config or RIG
     ensure_writable(target, overwrite)
     if not chosen:
-        chosen["numbers"] = _asked()
+        try:
+            chosen["numbers"] = _asked()
+        except click.Abort as error:
+            if sys.stdin.isatty():
+                raise
+            raise UsageError("the answers end before all is asked; --camera and --from ask nothing") from error
     return stage.init(target, stage.InitOptions(**chosen), overwrite=overwrite, console=console)
 
 
@@ -206,10 +212,10 @@ def _asked() -> RigNumbers:
         "pixel_um": _length("size of the pixels, um", plain.pixel_um, "um"),
         "columns": click.prompt("columns of the images", plain.columns, type=click.IntRange(min=1), err=True),
         "rows": click.prompt("rows of the images", plain.rows, type=click.IntRange(min=1), err=True),
-        "fluid": (fluid := _asked_for("refractive index of the fluid", plain.fluid, _above_zero)),
+        "fluid": (fluid := _asked_for("refractive index of the fluid", plain.fluid, _index)),
     }
     if fluid != 1.0:
-        answers["wall"] = _asked_for("refractive index of the wall or window", plain.wall, _above_zero)
+        answers["wall"] = _asked_for("refractive index of the wall or window", plain.wall, _index)
         answers["wall_mm"] = _length("its thickness, mm", plain.wall_mm, may_be_0=True)
         text = "inner width of the channel along the optical axis, mm, 0 without one"
         answers["channel_mm"] = _length(text, 0.0, may_be_0=True) or None
@@ -228,6 +234,14 @@ def _asked_for(text: str, default: float | str, parse: Callable[[str], Answer]) 
     """Ask for what a function makes of an answer; where it raises click asks again."""
     shown = default if isinstance(default, str) else f"{default:g}"
     return click.prompt(text, shown, value_proc=lambda answer: parse(answer.strip()), err=True)
+
+
+def _index(answer: str) -> float:
+    """Return a refractive index, which config files have from 1 to 5."""
+    value = _above_zero(answer)
+    if not 1.0 <= value <= 5.0:
+        raise click.UsageError(f"{answer}: expected a refractive index, from 1 to 5")
+    return value
 
 
 def _length(text: str, default: float, unit: str = "mm", may_be_0: bool = False) -> float:

@@ -254,7 +254,8 @@ WALL_DOTS, WALL_REACH = 40, 1.0
 # Of a box, as a share of its longest side, for how far away it is seen from.
 LEAST_SIDE = 0.1
 # From where it is seen, as the still picture: depth to the right, y up. A box that is longer than a cube of its
-# volume is seen from so much farther.
+# volume is seen from farther, by this power of it.
+FARTHER = 0.6
 EYE, LOOKED_AT = np.array([-1.2, 0.9, 0.85]), {"x": 0, "y": -0.15, "z": 0}
 
 
@@ -336,7 +337,9 @@ def lines_view(lines: Lines, walls: Walls | None = None, *, name: str = "view", 
         on_walls = wall_dots(lines.places_mm, walls)
         figure.add_trace(Scatter3d(_along_axes(on_walls), mode="markers", marker=dots, hoverinfo="skip"))
     sides = np.ptp(np.concatenate([*lines.places_mm, on_walls, np.zeros((1, 3))]), axis=0)
-    farther = sides.max() / np.prod(np.maximum(sides, LEAST_SIDE * sides.max())) ** (1.0 / 3.0) if sides.any() else 1.0
+    farther = 1.0
+    if sides.any():
+        farther = (sides.max() / np.prod(np.maximum(sides, LEAST_SIDE * sides.max())) ** (1.0 / 3.0)) ** FARTHER
     axes = {f"{axis}axis": {"title": f"{axis} (mm)"} for axis in "xyz"}
     scene = {
         **axes,

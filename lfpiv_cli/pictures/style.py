@@ -98,13 +98,16 @@ def symmetric_limit(*values: ArrayLike) -> float:
     return largest if largest > 0.0 else 1.0
 
 
-# Of a bar beside a panel, in widths of that.
-BAR_GAP, BAR_WIDTH = 0.05, 0.05
+# Of a bar beside a panel, in widths of that; in heights where it is so many times as high as wide.
+BAR_GAP, BAR_WIDTH, NARROW = 0.05, 0.05, 2.0
 
 
 def colour_bar(figure: Figure, drawn: Any, panel: Axes, label: str, **how: Any) -> Any:
     """Draw the bar of colours of what is `drawn` beside a panel, as high as that is; `how` as `colorbar` has it."""
-    place = panel.inset_axes((1.0 + BAR_GAP, 0.0, BAR_WIDTH, 1.0))
+    (left, right), (low, high) = panel.get_xlim(), panel.get_ylim()
+    height = abs(high - low) / abs(right - left)
+    tall = height if panel.get_aspect() == 1.0 and height > NARROW else 1.0
+    place = panel.inset_axes((1.0 + BAR_GAP * tall, 0.0, BAR_WIDTH * tall, 1.0))
     return figure.colorbar(drawn, cax=place, label=label, **how)
 
 

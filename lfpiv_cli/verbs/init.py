@@ -61,7 +61,7 @@ def init(output: Path, options: InitOptions, *, overwrite: bool = False, console
     if options.numbers is not None and (windows := windows_line(bench_of(settings, None))).verdict != "good":
         console.say(f"windows: {windows.reason}")
     console.say(f"next: lfpiv check {output}")
-    return {"config": output.name, "sections": list(tree), "schema": beside}
+    return {"config": output.name, "sections": list(tree)} | ({"schema": beside} if beside else {})
 
 
 def write_schema(output: Path, *, overwrite: bool = False) -> dict[str, Any]:
