@@ -5,6 +5,7 @@ Each function draws one figure, and its docstring is what the figure shows. `wri
 
 from __future__ import annotations
 
+import csv
 import re
 import shutil
 import tempfile
@@ -16,12 +17,9 @@ import numpy as np
 from click.testing import CliRunner
 from numpy.typing import NDArray
 from scipy import ndimage
-from scipy.stats import binned_statistic
 
-from lfpiv_cli import load_rig, open_particles, read_image
+from lfpiv_cli import load_rig, read_image
 from lfpiv_cli.cli.main import cli
-from lfpiv_cli.fields.fit import fit_field
-from lfpiv_cli.fields.structure import Samples
 from lfpiv_cli.files.images import write_tiff
 from lfpiv_cli.flow.outliers import validate_vectors
 from lfpiv_cli.flow.windows import WEIGHTINGS
@@ -31,7 +29,7 @@ from lfpiv_cli.optics.tracing import ObjectSpace
 from lfpiv_cli.particles.view import raw_view
 from lfpiv_cli.pictures.style import BLUE, GREEN, GREY, ORANGE, VERMILION, Axes, new_panels, styled
 from lfpiv_cli.reconstruction.solvers import SolverSettings, reconstruct
-from lfpiv_cli.synthetic.flows import advect, random_modes, rigid_rotation, taylor_green
+from lfpiv_cli.synthetic.flows import advect, rigid_rotation, taylor_green
 from lfpiv_cli.synthetic.render import Balls, Readout, render_points, render_white
 from lfpiv_cli.tracks.candidates import Seen
 from lfpiv_cli.tracks.sequences import follow
@@ -57,18 +55,6 @@ def show(axes: Axes, image: Picture, title: str = "", **how: object) -> None:
     """Show an image in steps of its square root, without numbers at its sides."""
     axes.imshow(np.sqrt(np.maximum(image, 0.0)), interpolation="nearest", **how)
     axes.set(xticks=[], yticks=[], title=title)
-
-
-@styled
-def tracer_by_depth(path: Path) -> None:
-    """The light of one tracer of 50 µm under the microlenses, by its depth in mm (Table 2's camera)."""
-    depths = (-4.0, -2.0, -1.0, -0.4, 0.4, 1.0, 2.0, 4.0)
-    figure, axes = new_panels(7.2, 3.9, 2, 4)
-    for each, z in zip(axes.ravel(), depths, strict=True):
-        ball = Balls([[0.02, -0.03, z]], 1e6, 0.05)
-        light = render_points(camera_of(130, 130), SPACE, ball, np.random.default_rng(1), rays=400_000)
-        show(each, light, f"z = {z:g}")
-    figure.savefig(path, dpi=150)
 
 
 @styled
@@ -197,87 +183,6 @@ def links(path: Path) -> None:
 
 
 @styled
-def covariances(path: Path, sample: Path) -> None:
-    """Particles of the sample and ellipses of 20 standard errors of their places, across and in depth.
-
-    The fifth of the particles whose depth is known worst is left out.
-    """
-    found = open_particles(sample / "particles" / "a.vtkhdf")
-    matrix, known = found.arrays["covariance_mm2"], found.arrays["covariance_mm2"][:, 2]
-    sure = known < np.quantile(known, 0.8)
-    figure, axes = new_panels(7.2, 3.2, 1, 2)
-    turn = np.linspace(0.0, 2.0 * np.pi, 40)
-    circle = np.stack([np.cos(turn), np.sin(turn)])
-    for each, (i, j, both), names in zip(axes, ((0, 1, 3), (0, 2, 5)), ("xy", "xz"), strict=True):
-        for place, (*own, _, _, _), together in zip(
-            found.position_mm[sure], matrix[sure], matrix[sure, both], strict=True
-        ):
-            root = np.linalg.cholesky([[own[i], together], [together, own[j]]])
-            each.plot(*(place[[i, j], np.newaxis] + 20.0 * root @ circle), color=BLUE, linewidth=0.7)
-        each.set(xlabel=f"{names[0]} (mm)", ylabel=f"{names[1]} (mm)", aspect="equal")
-    figure.savefig(path, dpi=150)
-
-
-def samples_of(flow: Callable[[Picture], Picture], points: Picture, sigma: Sequence[float], seed: int) -> Samples:
-    """Return displacements in mm of a flow with errors of these standard deviations."""
-    noise = np.random.default_rng(seed).normal(size=points.shape) * sigma
-    covariance = np.broadcast_to(np.diag(np.square(sigma)), (len(points), 3, 3)).copy()
-    return Samples(points, flow(points) + noise, covariance, np.ones(len(points)))
-
-
-@styled
-def kriging_and_bins(path: Path) -> None:
-    """The depth component along a line through turbulence: true, by means of tracks in bins, by the fitted field."""
-    turbulence = random_modes(1.0, longest_mm=8.0, shortest_mm=1.0, seed=4)
-    rng = np.random.default_rng(5)
-    points = rng.uniform((-4.0, -1.0, -1.0), (4.0, 1.0, 1.0), (700, 3))
-    samples = samples_of(lambda places: 0.1 * turbulence(places), points, (0.01, 0.01, 0.03), 6)
-    x = np.linspace(-4.0, 4.0, 200)
-    line = np.stack([x, 0.0 * x, 0.0 * x], axis=1)
-    value, variance = fit_field(samples, points.min(axis=0), points.max(axis=0)).estimate_at(line)
-    near = np.all(np.abs(points[:, 1:]) < 0.4, axis=1)
-    bins = np.linspace(-4.0, 4.0, 11)
-    mean = binned_statistic(points[near, 0], samples.value_mm[near, 2], "mean", bins).statistic
-    figure, axes = new_panels(6.4, 3.0)
-    axes.plot(x, 0.1 * turbulence(line)[:, 2], color="black", label="truth")
-    axes.step(bins, [*mean, mean[-1]], where="post", color=ORANGE, label="means of tracks in bins of 0.8 mm")
-    sigma = np.sqrt(variance[:, 2])
-    axes.fill_between(x, value[:, 2] - sigma, value[:, 2] + sigma, color=BLUE, alpha=0.25, linewidth=0.0)
-    axes.plot(x, value[:, 2], color=BLUE, label="field, and its standard error")
-    axes.set(xlabel="x (mm)", ylabel="displacement in depth (mm)")
-    axes.legend()
-    figure.savefig(path, dpi=150)
-
-
-@styled
-def divergence(path: Path) -> None:
-    """The depth component in Taylor-Green vortices: the truth, and fields fitted to noisy tracks.
-
-    Without and with what is known of a liquid's divergence. Depth is known ten times worse than the other components.
-    """
-    flow = taylor_green(1.0, 6.0)
-    rng = np.random.default_rng(7)
-    points = rng.uniform(-3.0, 3.0, (2500, 3))
-    samples = samples_of(lambda places: 0.1 * flow(places), points, (0.004, 0.004, 0.06), 8)
-    side = np.linspace(-2.8, 2.8, 41)
-    x, z = np.meshgrid(side, side)
-    plane = np.stack([x, 0.0 * x, z], axis=-1).reshape(-1, 3)
-    true = 0.1 * flow(plane)[:, 2]
-    fitted = {
-        name: fit_field(samples, [-3.0] * 3, [3.0] * 3, kind).value_at(plane)[:, 2]
-        for name, kind in (("divergence unknown", "off"), ("divergence penalised", "penalised"))
-    }
-    figure, axes = new_panels(7.2, 2.6, 1, 3)
-    for each, (name, value) in zip(axes, ({"truth": true} | fitted).items(), strict=True):
-        picture = each.pcolormesh(side, side, value.reshape(x.shape), cmap="RdBu_r", vmin=-0.12, vmax=0.12)
-        rms = float(np.sqrt(np.mean((value - true) ** 2)))
-        each.set(title=name + (f"\nrms {rms:.3f} mm" if rms else "\n"), xlabel="x (mm)", aspect="equal")
-    axes[0].set_ylabel("z (mm)")
-    figure.colorbar(picture, ax=axes, label="mm")
-    figure.savefig(path, dpi=150)
-
-
-@styled
 def solvers(path: Path) -> None:
     """The light of a tracer at z = 4 mm in reconstructed volumes along its depth, by solver and number of steps."""
     camera, grid = camera_of(200, 200), Grid.centred((25, 25, 61), (0.05, 0.05, 0.1), (0.0, 0.0, 4.0))
@@ -382,26 +287,116 @@ def trajectories(path: Path) -> None:
     figure.savefig(path, dpi=150)
 
 
+def table(name: str) -> list[dict[str, str]]:
+    """Return the rows of a table of the page Accuracy."""
+    with open(ROOT / "docs" / "accuracy" / f"{name}.csv", encoding="utf-8", newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def column(rows: list[dict[str, str]], name: str) -> Picture:
+    """Return a column of numbers, NaN where a cell is empty."""
+    return np.array([float(row[name] or "nan") for row in rows])
+
+
+def dots(axes: Axes, rows: list[dict[str, str]], name: str, labels: Sequence[str], orange: Sequence[bool]) -> None:
+    """Draw a column as dots on lines with their labels, the first one on top."""
+    places = np.arange(len(rows))[::-1]
+    axes.hlines(places, 0.0, 1.0, transform=axes.get_yaxis_transform(), color="0.9", linewidth=0.8)
+    axes.scatter(column(rows, name), places, color=[ORANGE if each else BLUE for each in orange], zorder=2)
+    axes.set_yticks(places, labels)
+    axes.set(xlabel=name, xscale="log")
+
+
+@styled
+def accuracy_boards(path: Path) -> None:
+    """How far the depths between a board's planes are off (Table 3), and the flow in a channel (Section 4.2)."""
+    figure, axes = new_panels(9.0, 3.4, 1, 2)
+    for each, name, figures, sort in zip(
+        axes, ("boards", "channel"), ("depth error, %", "mean error, %"), ("camera", "images"), strict=True
+    ):
+        rows = table(name)
+        labels = [f"{row['by']} ({row[sort]})" for row in rows]
+        dots(each, rows, figures, labels, ["paper" in row["by"] for row in rows])
+    figure.savefig(path, dpi=150)
+
+
+@styled
+def accuracy_seeding(path: Path) -> None:
+    """What is found, and how well, by the number of tracers for each microlens; full sensor, and crowded cuts of it."""
+    figure, axes = new_panels(9.0, 3.0, 1, 3)
+    full, crowded = table("seeding"), table("crowded")
+    groups = {"whole sensor, rays": (full, "-")}
+    groups |= {f"a cut, {light}": ([r for r in crowded if r["light"] == light], ":") for light in ("rays", "waves")}
+    within = {"whole sensor, rays": "within 1.96 σ, z"}
+    for (name, (rows, line)), colour in zip(groups.items(), (BLUE, ORANGE, GREEN), strict=True):
+        density = column(rows, "per microlens")
+        axes[0].plot(density, column(rows, "recall"), f"o{line}", color=colour, label=f"{name}: recall")
+        axes[0].plot(density, column(rows, "precision"), f"^{line}", color=colour, label="precision")
+        axes[2].plot(density, column(rows, within.get(name, "within 1.96 σ, worst axis")), f"o{line}", color=colour)
+    for name, marker in (("spread x, voxel", "o"), ("spread z, voxel", "^")):
+        axes[1].plot(column(full, "per microlens"), column(full, name), f"{marker}-", color=BLUE, label=name)
+    axes[2].axhline(0.95, color=GREY, linewidth=0.8)
+    axes[1].set(yscale="log")
+    for each, label in zip(axes, ("share", "voxel of 0.1 mm", "within 1.96 σ, worst axis or z"), strict=True):
+        each.set(xlabel="tracers for each microlens", ylabel=label)
+    axes[0].legend(fontsize=6)
+    axes[1].legend()
+    figure.savefig(path, dpi=150)
+
+
+@styled
+def accuracy_waves(path: Path) -> None:
+    """The scatter in depth of tracers fitted by rays and by waves, by the light that the images were made of."""
+    figure, axes = new_panels(7.2, 2.8)
+    rows = table("waves")
+    by_rays = [row["fitted by"] == "rays" for row in rows]
+    dots(axes, rows, "spread z", [f"{row['tracers']} (images by {row['images by']})" for row in rows], by_rays)
+    axes.set_xlabel("spread in depth, voxels of 0.1 mm")
+    figure.savefig(path, dpi=150)
+
+
+@styled
+def accuracy_sequences(path: Path) -> None:
+    """What `follow` finds, and how well, by the distance from the focal plane."""
+    figure, axes = new_panels(7.2, 2.6, 1, 2)
+    rows = table("sequences")
+    names, places = [row["distance from the focal plane"] for row in rows], np.arange(len(rows))[::-1]
+    for offset, name, colour in ((0.18, "recall", BLUE), (-0.18, "precision", ORANGE)):
+        axes[0].barh(places + offset, 1.0 - column(rows, name), 0.36, color=colour, label=f"1 - {name}")
+    for offset, name, colour in ((0.18, "rms x, voxel", BLUE), (-0.18, "rms z, voxel", ORANGE)):
+        axes[1].barh(places + offset, column(rows, name), 0.36, color=colour, label=name)
+    axes[0].set_yticks(places, names)
+    axes[1].set(yticks=[], xscale="log", xlabel="voxel of 0.1 mm")
+    axes[0].set_xlabel("share")
+    for each in axes:
+        each.set_ylim(-0.6, len(rows) + 0.5)
+        each.legend(loc="upper right", ncols=2)
+    figure.savefig(path, dpi=150)
+
+
 FROM_NOTHING: tuple[Callable[[Path], None], ...] = (
-    tracer_by_depth,
     seeding,
     lattices,
     links,
-    kriging_and_bins,
-    divergence,
     solvers,
     bound,
     outliers,
     weightings,
     trajectories,
+    accuracy_boards,
+    accuracy_seeding,
+    accuracy_waves,
+    accuracy_sequences,
 )
-FROM_THE_SAMPLE: tuple[Callable[[Path, Path], None], ...] = (white_images, board_images, particle_images, covariances)
+FROM_THE_SAMPLE: tuple[Callable[[Path, Path], None], ...] = (white_images, board_images, particle_images)
 
 
 def write_all(folder: Path, sample: Path) -> None:
     """Draw all figures; `sample` is the folder of the sample's chain."""
     folder.mkdir(exist_ok=True)
     for draw in FROM_NOTHING:
+        print(f"docs: figure {draw.__name__}", flush=True)
         draw(folder / f"{draw.__name__}.png")
     for draw_sample in FROM_THE_SAMPLE:
+        print(f"docs: figure {draw_sample.__name__}", flush=True)
         draw_sample(folder / f"{draw_sample.__name__}.png", sample)
