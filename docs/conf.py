@@ -27,7 +27,7 @@ extensions = [
     "numpydoc",
 ]
 # Parts of pages, and the sample's files.
-exclude_patterns = ["_generated/sample", "_generated/tree.md", "_generated/interface.md"]
+exclude_patterns = ["_generated/sample", *(f"_generated/{name}.md" for name in ("tree", "interface", "gallery"))]
 myst_enable_extensions = ["dollarmath", "deflist", "colon_fence"]
 myst_heading_anchors = 3
 # Two dashes begin an option; they are no dash.

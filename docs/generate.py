@@ -2,16 +2,19 @@
 
 Everything goes into `docs/_generated`, which is not kept: the sample's chain with its pictures and what it prints, a
 page for each command, the Python interface, the tree of the package, the drawings of the light's way and of a pipe's
-board, a tracer's light by rays and waves, statistics of a turbulent channel, and the figures.
+board, a tracer's light by rays and waves, statistics of a turbulent channel, the figures, and the gallery.
 """
 
 from __future__ import annotations
 
 import ast
+import contextlib
 import hashlib
 import inspect
+import io
 import os
 import re
+import runpy
 import shutil
 import subprocess
 import sys
@@ -24,15 +27,26 @@ import click_commands
 import drawing
 import figures
 import light_figure
+import matplotlib
+import matplotlib.pyplot as plt
 import statistics_figure
 
 import lfpiv_cli
+
+# Scripts of the gallery draw into files, whatever screen there is.
+matplotlib.use("Agg")
 
 DOCS = Path(__file__).parent
 ROOT = DOCS.parent
 PACKAGE = ROOT / "lfpiv_cli"
 GENERATED = DOCS / "_generated"
 SAMPLE = GENERATED / "sample"
+GALLERY = ROOT / "examples" / "gallery"
+# Its scripts, in the order of the page: from one voxel to statistics.
+SCRIPTS = (
+    *("one_voxel", "tracer_by_depth", "another_camera", "calibration_residuals", "covariance_ellipses"),
+    *("seeding_and_error", "profile", "tracks_by_speed", "kriging_and_bins", "divergence_and_pressure", "convergence"),
+)
 
 RIG = "--dark dark.tif"
 # The sample's chain as the page Start types it, and the pictures that other pages show.
@@ -66,9 +80,11 @@ def everything() -> None:
     GENERATED.mkdir(exist_ok=True)
     (GENERATED / "light.svg").write_text(drawing.light(), encoding="utf-8")
     (GENERATED / "pipe_board.svg").write_text(drawing.board_of_a_pipe(), encoding="utf-8")
+    print("docs: light by waves, statistics of a channel", flush=True)
     light_figure.write_figure(ROOT / "configs" / "table2.yaml", GENERATED / "light_by_waves.png")
     statistics_figure.write_figure(INPUTS["rig.yaml"], GENERATED / "statistics.png")
     (GENERATED / "tree.md").write_text("\n".join(tree()) + "\n", encoding="utf-8")
+    (GENERATED / "gallery.md").write_text("\n".join(gallery()) + "\n", encoding="utf-8")
     (GENERATED / "interface.md").write_text("\n".join(interface()) + "\n", encoding="utf-8")
     write_command_pages()
     run_sample()
@@ -86,6 +102,7 @@ def run_sample() -> None:
         shutil.copyfile(source, SAMPLE / name)
     environment = os.environ | {"PYTHONPATH": str(ROOT), "NO_COLOR": "1"}
     for name, arguments in CHAIN.items():
+        print(f"docs: lfpiv {arguments}", flush=True)
         command = [sys.executable, "-m", "lfpiv_cli", *arguments.split()]
         # As a terminal shows it: words at work and the answer in their order.
         heard: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
@@ -94,15 +111,31 @@ def run_sample() -> None:
             raise RuntimeError(f"lfpiv {arguments}: exit code {done.returncode}: {done.stdout}")
         (SAMPLE / f"{name}.txt").write_text(f"$ lfpiv {arguments}\n{done.stdout}", encoding="utf-8")
     figures.write_all(GENERATED / "figures", SAMPLE)
+    for name in SCRIPTS:
+        print(f"docs: gallery {name}", flush=True)
+        with contextlib.chdir(SAMPLE), contextlib.redirect_stdout(io.StringIO()):
+            runpy.run_path(str(GALLERY / f"{name}.py"))
+        plt.close("all")
     stamp.write_text(made_from)
 
 
 def fingerprint() -> str:
     """Return a hash of the package, the figures, the sample and the chain."""
     digest = hashlib.sha256(repr(CHAIN).encode())
-    for path in [*sorted(PACKAGE.rglob("*.py")), DOCS / "figures.py", *INPUTS.values()]:
+    drawn_from = [DOCS / "figures.py", *sorted((DOCS / "accuracy").iterdir()), *sorted(GALLERY.glob("*.py"))]
+    for path in [*sorted(PACKAGE.rglob("*.py")), *drawn_from, *INPUTS.values()]:
         digest.update(path.read_bytes())
     return digest.hexdigest()
+
+
+def gallery() -> Iterator[str]:
+    """Yield the scripts of the gallery: what each is about, its picture and its code."""
+    for name in SCRIPTS:
+        text = (GALLERY / f"{name}.py").read_text(encoding="utf-8")
+        title, about = (ast.get_docstring(ast.parse(text)) or "").split("\n\n", 1)
+        yield from (f"## {title.rstrip('.')}\n", f"{about}\n", f"```{{image}} /_generated/sample/{name}.png")
+        yield from (f":alt: {title}\n```\n", f"```{{literalinclude}} /../examples/gallery/{name}.py")
+        yield from (":language: python", ":start-at: import", "```\n")
 
 
 def write_command_pages() -> None:

@@ -7,9 +7,11 @@ and what the chain makes of it, so that a page can begin anywhere. Small configs
 from __future__ import annotations
 
 import contextlib
+import csv
 import glob
 import itertools
 import re
+import runpy
 import shlex
 import shutil
 from collections.abc import Iterator
@@ -292,6 +294,55 @@ def furnished(tmp_path_factory: pytest.TempPathFactory) -> Path:
             run(command)
     write_third_frame(folder)
     return folder
+
+
+@pytest.fixture(scope="module")
+def measured(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder in which scripts of the gallery run: the sample, and its volumes, vectors, particles and tracks."""
+    folder = tmp_path_factory.mktemp("measured")
+    write_images(folder)
+    write_configs(folder)
+    chain = [command for command in chain_of(ROOT / "README.md") if command.split()[1] not in ("run", "validate")]
+    last = next(number for number, command in enumerate(chain) if command.split()[1] == "track")
+    with contextlib.chdir(folder):
+        for command in chain[: last + 1]:
+            run(command)
+    return folder
+
+
+GALLERY = sorted((ROOT / "examples" / "gallery").glob("*.py"))
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("script", GALLERY, ids=lambda script: script.stem)
+def test_every_script_of_the_gallery_runs_and_draws(script, measured, tmp_path, monkeypatch) -> None:
+    plt = pytest.importorskip("matplotlib.pyplot")
+    monkeypatch.setenv("MPLBACKEND", "Agg")
+    plt.switch_backend("Agg")
+    shutil.copytree(measured, tmp_path, dirs_exist_ok=True)
+    with contextlib.chdir(tmp_path):
+        runpy.run_path(str(script))
+    plt.close("all")
+    assert (tmp_path / f"{script.stem}.png").stat().st_size > 10_000
+
+
+def test_tables_of_accuracy_stand_in_one_place() -> None:
+    page, drawn = ((ROOT / "docs" / name).read_text() for name in ("accuracy.md", "figures.py"))
+    for file in (ROOT / "docs" / "accuracy").iterdir():
+        assert f":file: accuracy/{file.name}" in page
+        assert f'"{file.stem}"' in drawn
+        with open(file, newline="") as rows:
+            assert len({len(row) for row in csv.reader(rows)}) == 1, file
+
+
+def test_the_gallery_is_of_short_scripts_which_the_page_shows() -> None:
+    page = (ROOT / "docs" / "generate.py").read_text()
+    assert len(GALLERY) >= 10
+    for script in GALLERY:
+        lines = script.read_text().splitlines()
+        assert len(lines) <= 42, script
+        assert re.fullmatch(r'"""[A-Z].*\.', lines[0]), script
+        assert f'"{script.stem}"' in page, script
 
 
 @pytest.mark.slow
