@@ -17,9 +17,9 @@ dt_s, rng, sigma_mm, half_mm = 1e-3, np.random.default_rng(7), np.array([0.004, 
 flow = taylor_green(0.1, 6.0)  # m/s: in a millisecond as many 1e-3 m, that is mm
 rig = lf.load_rig("rig.yaml").overridden("media", fluid_density_kg_m3=998.2, fluid_viscosity_pa_s=1e-3)
 rig = rig.overridden("volume", shape_xyz=(60, 60, 60)).overridden("correlation", windows=((10, 10, 10),), dt_s=dt_s)
-points = rng.uniform(-half_mm, half_mm, (1200, 3))
+points = rng.uniform(-half_mm, half_mm, (700, 3))
 moved = 1e3 * dt_s * flow(points) + sigma_mm * rng.normal(size=points.shape)
-samples = Samples(points, moved, np.tile(np.diag(sigma_mm**2), (1200, 1, 1)), np.ones(1200))
+samples = Samples(points, moved, np.tile(np.diag(sigma_mm**2), (700, 1, 1)), np.ones(700))
 fits = {kind: fit_field(samples, -half_mm, half_mm, kind) for kind in ("off", "penalised")}
 pressed = pressure_of_steady_flow(fits["penalised"], dt_s, rig)
 centres, middle = pressed.grid.centres_mm(), pressed.grid.shape_xyz[1] // 2
