@@ -237,16 +237,19 @@ def photograph_white(config: Path, images: Path) -> None:
 
 
 def veil(images: Path, rig: DrawnRig) -> None:
-    """Add haze to the tracers' images: light of the white image's shape that fades to a half across the sensor."""
+    """Add haze to the tracers' images: light of the white image's shape that fades to a half across the sensor.
+
+    It is as noisy as the tracers' light, of which a ray is more than a photon: a camera has one law for both.
+    """
     scene, sensor = rig.true["simulation"], rig.true["camera"]["sensor"]
     rng = np.random.default_rng([scene["seed"], 2])
     shape = (sensor["rows"], sensor["columns"])
     dark, white = (read_image(images / f"{name}.tif", shape=shape).astype(np.float64) for name in ("dark", "white"))
     lit = np.maximum(white - dark, 0.0)
     haze = rig.haze * lit / np.quantile(lit, 0.99) * np.linspace(1.0, 0.5, shape[1])
+    per_photon = 1.0 / scene["photons_per_count"] + scene["particle_counts"] / scene["rays"]
     for name in ("pair_a", "pair_b"):
-        photons = rng.poisson(haze * scene["photons_per_count"]) / scene["photons_per_count"]
-        image = read_image(images / f"{name}.tif", shape=shape) + photons
+        image = read_image(images / f"{name}.tif", shape=shape) + rng.poisson(haze / per_photon) * per_photon
         full = 2.0 ** scene["bits"] - 1.0
         write_tiff(images / f"{name}.tif", np.minimum(np.rint(image), full).astype(np.uint16), overwrite=True)
 
