@@ -1,6 +1,7 @@
 """`validate flow` and `validate all`: truths, limits, and a simulated experiment through the whole chain."""
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -120,6 +121,9 @@ def test_the_truth_is_the_flow_that_the_config_names_or_else_that_of_particles(
         report = tmp_path / f"{rig.stem} {rate_per_s}"
         summary = told(capsys, "validate", "flow", rig, "--vectors", vectors, "--particles", particles, "-o", report)
         assert summary["truth"] == written(report)["truth"] == truth
+        # In words, for people; all figures are with -v.
+        words = rf"60 of 60 vectors valid; beside the {truth}: mean along .* % off; .*% of .* rms of u, v, w .* voxel\."
+        assert re.fullmatch(words, summary["summary"][0])
         assert rms[0] <= written(report)["figures"]["rms_u_voxel"] < rms[1]
         assert [each["code"] for each in summary["warnings"]] == warned
         pictures = sorted(path.name for path in report.glob("*.png"))

@@ -80,7 +80,7 @@ def image_figure(image: Floats, places: Floats, z_mm: Floats) -> style.Figure:
     rows, columns = image.shape
     axes.set(xlim=(-0.5, columns - 0.5), ylim=(rows - 0.5, -0.5))
     style.colour_bar(figure, dots, axes, "depth z (mm)")
-    axes.set_title(f"image and the places of {len(z_mm)} particles (rays through the middle of the lens)")
+    axes.set_title(f"image and {len(z_mm)} particles (rays through the middle of the lens)")
     return figure
 
 
@@ -256,7 +256,7 @@ LEAST_SIDE = 0.1
 # From where it is seen, as the still picture: depth to the right, y up. A box that is longer than a cube of its
 # volume is seen from farther, by this power of it.
 FARTHER = 0.6
-EYE, LOOKED_AT = np.array([-1.2, 0.9, 0.85]), {"x": 0, "y": -0.15, "z": 0}
+EYE, LOOKED_AT = np.array([-1.4, 1.05, 1.0]), {"x": 0, "y": -0.28, "z": 0}
 
 
 def has_views() -> bool:

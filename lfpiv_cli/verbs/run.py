@@ -149,7 +149,8 @@ def take_all(chain: Chain) -> dict[str, Any]:
     reported["summary"] = in_words(chain, reported, [*fields.values()][-1], worked.failures)
     if worked.failures:
         first, records = worked.failures[0], [asdict(failure) for failure in worked.failures]
-        text = f"{len(records)} frames or pairs failed, the first {first.name}: {first.error}"
+        number = "one frame or pair" if len(records) == 1 else f"{len(records)} frames or pairs"
+        text = f"{number} failed, the first {first.name}: {first.error}"
         raise PartialError(text, reported | {"failures": records})
     return reported
 
@@ -167,7 +168,7 @@ def in_words(chain: Chain, reported: Mapping[str, Any], vectors: Vectors, failur
     shown += [f"{flow} in ParaView"] if flow is not None else []
     return [
         *filter(None, [reported.get("sentence")]),
-        f"by {reported['method']}: {reported['reason']}",
+        f"by {reported['method'].replace('both', 'volumes and particles')}: {reported['reason']}",
         *(f"failed: {failure.name}: {failure.error}" for failure in failures),
         *files,
         f"open next: {', '.join(shown)}" if shown else f"all is in {output}",

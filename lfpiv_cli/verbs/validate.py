@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lfpiv_cli.arrays import Floats
-from lfpiv_cli.console import CONSOLE, Console
+from lfpiv_cli.console import CONSOLE, Console, readable
 from lfpiv_cli.errors import ConfigError, InputError, LimitMissedError, UsageError
 from lfpiv_cli.files import vtkhdf
 from lfpiv_cli.files.atomic import ensure_writable, write_json
@@ -204,12 +204,27 @@ def validate_flow(
     summary: dict[str, Any] = {name: value for name, value in first.items() if not isinstance(value, (list, dict))}
     if is_simulated:
         summary = {name: {method: found[name] for method, found in figures.items()} for name in summary}
+    else:
+        summary["summary"] = _in_words(summary, truth, output)
     summary["truth"] = truth
     if len(methods) > 1:
         summary["lower_error"] = report["lower_error"]
     if missed:
         raise LimitMissedError(f"{paths['flow.json']}: {'; '.join(missed)}", summary)
     return summary
+
+
+def _in_words(found: Mapping[str, Any], truth: str, output: Path) -> list[str]:
+    """Return what a person wants to know of vectors beside the truth."""
+    error, within = found["streamwise_mean_error"], found["within_25_percent_vector"]
+    rms = ", ".join(readable(found[f"rms_{name}_voxel"], digits=2) for name in "uvw")
+    mean = "" if error is None else f"mean along the flow {100.0 * error:+.2g} % off; "
+    shares = "" if within is None else f"{within:.0%} of the vectors within 25 % of the true ones; "
+    return [
+        f"{found['vectors_valid']} of {found['vectors']} vectors valid; beside the {truth}: {mean}{shares}"
+        f"rms of u, v, w {rms} voxel.",
+        f"all figures: -v, --json, or {output / 'flow.json'}",
+    ]
 
 
 def measure_images(
