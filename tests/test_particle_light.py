@@ -19,6 +19,7 @@ from lfpiv_cli.particles.fitting import add_all
 from lfpiv_cli.particles.least_squares import observation_of
 from lfpiv_cli.particles.microlens_focus import FEWEST_PARTICLES, FocalLength, focal_length_of
 from lfpiv_cli.particles.search import (
+    DOUBTFUL_EXCESS,
     MUCH_LEFT,
     TAKEN_UP,
     blank,
@@ -79,15 +80,22 @@ def test_errors_do_not_grow_for_what_is_noise(view: View) -> None:
 def test_variances_grow_with_what_the_best_ones_do_not_leave(rng: np.random.Generator) -> None:
     # By noise alone chi-squared of 330 pixels scatters by a thirteenth, and nothing is missing.
     noise = rng.chisquare(330, 2000) / 330
-    assert np.mean(missing_light(noise, noise, 330.0)) < 1.3
+    light, known = rng.uniform(0.6, 1.4, noise.size), np.ones(noise.size, np.bool_)
+    assert np.mean(missing_light(noise, light, known, 330.0)) < 1.1
+    # Nor is it where noise goes with a particle's light: it is as much larger, and no more.
+    np.testing.assert_allclose(np.mean(missing_light(light * noise, light, known, 330.0) / light), 1.0 / 0.64, rtol=0.1)
     # One by itself tells no other reference than 1.
-    assert missing_light(np.array([0.9]), np.array([0.9]), 330.0) == pytest.approx(1.0)
-    assert missing_light(np.zeros(0), np.array([4.0]), 330.0) == pytest.approx(1.0 + TAKEN_UP, rel=0.1)
+    assert missing_light(np.array([0.9]), np.ones(1), known[:1], 330.0) == pytest.approx(1.0)
+    # A root of chi-squared that is twice that of the best ones counts nearly whole.
+    twice = 1.0 + TAKEN_UP / (1.0 + DOUBTFUL_EXCESS)
+    assert missing_light(np.array([4.0]), np.ones(1), ~known[:1], 330.0) == pytest.approx(twice, rel=0.1)
     # In crowds noise seems four times as large as it is, and 1 is no good particle's chi-squared.
-    crowd = np.concatenate([0.25 * noise[:200], rng.lognormal(1.0, 1.5, 800)])
-    at_best, at_one, at_hundred = missing_light(crowd, np.array([0.25, 1.0, 100.0]), 330.0)
+    crowd = np.concatenate([0.25 * noise[:200], rng.lognormal(1.0, 1.5, 800), [0.25, 1.0, 100.0]])
+    light, known = rng.uniform(0.6, 1.4, crowd.size), np.arange(crowd.size) < 1000
+    light[-3:] = 1.0
+    at_best, at_one, at_hundred = missing_light(crowd, light, known, 330.0)[-3:]
     assert at_best < 1.5
-    assert at_one == pytest.approx(1.0 + TAKEN_UP, rel=0.2)
+    assert at_one == pytest.approx(twice, rel=0.2)
     assert at_hundred == pytest.approx(1.0 + 19.0 * TAKEN_UP, rel=0.2)
 
 

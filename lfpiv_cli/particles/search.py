@@ -89,8 +89,12 @@ GOOD_PERCENTILE = 20.0
 # For errors it is that of the particles that fit best, at most 1: crowds make noise seem larger than it is. What others
 # exceed it by is light of neighbours that were not found, or wrongly. A particle takes up most of what is like its own
 # light, and shows the less of it; so their variance grows with the root of chi-squared, by this factor: of tracers at
-# twice the best ones' chi-squared it is six times as large, of those at a hundred times a hundred times.
-BEST_PERCENTILE, TAKEN_UP = 5.0, 12.0
+# twice the best ones' chi-squared it is five times as large, of those at a hundred times a hundred times. Roots that
+# exceed the best one by less may still be noise, and count for less: what is stated weighs tracks against each other.
+BEST_PERCENTILE, TAKEN_UP, DOUBTFUL_EXCESS = 5.0, 12.0, 0.15
+# Noise that grows with a particle's light is none of its neighbours: the best ones are those of so many classes of
+# light, of at least so many particles.
+CLASSES, SMALLEST_CLASS = 8, 60
 # Particles of which so much is seen tell what fits best.
 LEAST_SEEN = 0.5
 # Lengths are in the camera's own units (`Scale`): microlenses laterally, depths over which light spreads by one lens
@@ -369,19 +373,27 @@ def usual_chi2(chi2: Floats) -> float:
     return float(np.percentile(chi2, GOOD_PERCENTILE)) if chi2.size else 1.0
 
 
-def missing_light(known: Floats, chi2: Floats, pixels: float) -> Floats:
-    """Return by what factor light that was not found raises the variance of particles with chi-squared (n,), 1 or more.
+def missing_light(chi2: Floats, light: Floats, known: NDArray[np.bool_], pixels: float) -> Floats:
+    """Return by what factor light that was not found raises the variance of particles (n,), 1 or more.
 
     Parameters
     ----------
-    known : (m,) chi-squared of particles that are well seen
+    chi2, light, known : (n,) of the particles, and whether they are well seen
     pixels : over which a particle's light is spread: of as many, noise alone scatters chi-squared
     """
     scatter = float(np.sqrt(2.0 / pixels))
-    best = float(np.percentile(known, BEST_PERCENTILE)) if known.size else 1.0
-    # The best ones of many are by chance below what noise makes.
-    best = min(best / (1.0 + scatter * ndtri(0.01 * BEST_PERCENTILE)), 1.0) * (1.0 + scatter)
-    return np.asarray(1.0 + TAKEN_UP * (np.sqrt(np.maximum(chi2 / best, 1.0)) - 1.0))
+    best, noisier = 1.0, np.ones(len(chi2))
+    if known.any():
+        fit_best = float(np.percentile(chi2[known], BEST_PERCENTILE))
+        # The best ones of many are by chance below what noise makes.
+        best = min(fit_best / (1.0 + scatter * ndtri(0.01 * BEST_PERCENTILE)), 1.0)
+        number = int(np.clip(np.count_nonzero(known) // SMALLEST_CLASS, 1, CLASSES))
+        classes = np.array_split(np.flatnonzero(known)[np.argsort(light[known], kind="stable")], number)
+        of_classes = [float(np.percentile(chi2[members], BEST_PERCENTILE)) for members in classes]
+        middles = [float(np.median(light[members])) for members in classes]
+        noisier = np.interp(light, middles, of_classes) / max(fit_best, np.finfo(np.float64).tiny)
+    over = np.sqrt(np.maximum(chi2 / (noisier * best * (1.0 + scatter)), 1.0)) - 1.0
+    return np.asarray(np.maximum(noisier, 1.0) * (1.0 + TAKEN_UP * over**2 / (over + DOUBTFUL_EXCESS)))
 
 
 def result(task: Task, state: State) -> Particles:
@@ -397,7 +409,7 @@ def result(task: Task, state: State) -> Particles:
     changes = None
     if task.light_covariance is not None:
         changes = changes_of_light(task.view, particles, task.light_covariance, task.depths_mm)
-    missing = missing_light(chi2[seen > LEAST_SEEN], chi2, lens_pixels(task.view))
+    missing = missing_light(chi2, particles[:, 3], seen > LEAST_SEEN, lens_pixels(task.view))
     covariance = joint_covariance(observation, particles, correlation, missing, changes)
     # Where there is a model: elsewhere is the light of particles that were not found.
     lit = task.usable & (task.light - state.residual > LIT_SIGMAS * state.noise.read_counts)
