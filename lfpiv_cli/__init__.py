@@ -26,7 +26,6 @@ into the functions above. Volumes and fields are indexed [z, y, x]; points and v
 
 Each command is a function as well, files in and files out, with its options as a dataclass::
 
-    from lfpiv_cli.verbs.moments import statistics as statistics
     from lfpiv_cli.verbs.reconstruct import ReconstructOptions, reconstruct_files
 
     reconstruct_files(Path("weights.h5"), images, Path("volumes"), ReconstructOptions(dark=Path("dark.tif")))
