@@ -1,8 +1,8 @@
-"""What arrays hold, for signatures."""
+"""What arrays hold, for signatures; and a sum that is the same with any number of threads."""
 
 from __future__ import annotations
 
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,3 +13,8 @@ Floats: TypeAlias = NDArray[np.float64]
 Singles: TypeAlias = NDArray[np.float32]
 Integers: TypeAlias = NDArray[np.int64]
 Flags: TypeAlias = NDArray[np.bool_]
+
+
+def root_of_squares(values: NDArray[Any]) -> float:
+    """Return the root of the sum of squares, the same however many threads BLAS, which norms are taken by, has."""
+    return float(np.sqrt(np.sum(np.square(values))))

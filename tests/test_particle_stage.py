@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 import tifffile
 from scipy.spatial import KDTree
+from threadpoolctl import threadpool_limits
 
+from lfpiv_cli.arrays import root_of_squares
 from lfpiv_cli.errors import InputError, OutputExistsError, PartialError, UsageError
 from lfpiv_cli.files import vtkhdf
 from lfpiv_cli.files.config import carried_config, load_rig
@@ -446,3 +448,13 @@ def test_a_flow_with_velocity_in_depth(tmp_path: Path) -> None:
     assert figures["slope_u"] == pytest.approx(1.0, abs=0.01)
     assert figures["slope_w"] == pytest.approx(1.0, abs=0.02)
     assert figures["within_25_percent_vector"] > 0.99
+
+
+def test_a_root_of_squares_is_the_same_with_any_number_of_threads() -> None:
+    for seed in range(5):
+        values, found = np.random.default_rng(seed).normal(size=(448, 450)), set()
+        for threads in (1, 2):
+            with threadpool_limits(threads, user_api="blas"):
+                found.add(root_of_squares(values))
+        assert found == {pytest.approx(np.linalg.norm(values), rel=1e-13)}
+        assert len(found) == 1

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from lfpiv_cli.arrays import Floats
+from lfpiv_cli.arrays import Floats, root_of_squares
 from lfpiv_cli.console import CONSOLE, Console
 from lfpiv_cli.errors import InputError, UsageError
 from lfpiv_cli.fields import pressure
@@ -134,7 +134,7 @@ def _gradients(
     )
     return samples, {
         "acceleration_rms_m_s2": (to_m_s2 * np.sqrt(np.mean(acceleration**2, axis=0))).tolist(),
-        "friction_share": float(np.linalg.norm(friction) / np.linalg.norm(acceleration)),
+        "friction_share": root_of_squares(friction) / root_of_squares(acceleration),
     }
 
 
@@ -170,7 +170,7 @@ def link_probability(trajectories: Points) -> Floats:
 
 def neglected_share(motion: Motion) -> float:
     """Return how much of the accelerations is wrong alike among neighbours."""
-    return float(np.linalg.norm(motion.neglected) / np.linalg.norm(motion.acceleration))
+    return root_of_squares(motion.neglected) / root_of_squares(motion.acceleration)
 
 
 def _on_windows(

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lfpiv_cli.arrays import Floats
+from lfpiv_cli.arrays import Floats, root_of_squares
 from lfpiv_cli.errors import ConfigError, InputError
 from lfpiv_cli.files.batch import Frame as ImageFrame
 from lfpiv_cli.files.config import Config, carried_config
@@ -320,8 +320,8 @@ def points_of(bench: Bench, frame: Frame, found: Particles, size: TracerSize, pr
     camera, (width, height, _) = content.camera, np.diff(bounds)[:, 0]
     lenses = float(width * height) * camera.magnification**2 / camera.lattice.cell_area
     left, haze = what_is_left(frame, found), frame.haze
-    norm = float(np.linalg.norm(np.where(frame.unusable, 0.0, frame.light)))
-    share_left = float(np.linalg.norm(left)) / norm if norm > 0.0 else 0.0
+    norm = root_of_squares(np.where(frame.unusable, 0.0, frame.light))
+    share_left = root_of_squares(left) / norm if norm > 0.0 else 0.0
     # Of four tracers for each microlens only 1.3 are found, and few of them are right.
     number = tracers_per_lens(bench, frame) if share_left > MUCH_LEFT else None
     focus = _focal_length(bench, frame, found)
