@@ -218,7 +218,7 @@ def _in_words(found: Mapping[str, Any], truth: str, output: Path) -> list[str]:
     """Return what a person wants to know of vectors beside the truth."""
     error, within = found["streamwise_mean_error"], found["within_25_percent_vector"]
     rms = ", ".join(readable(found[f"rms_{name}_voxel"], digits=2) for name in "uvw")
-    mean = "" if error is None else f"mean along the flow {100.0 * error:+.2g} % off; "
+    mean = "" if error is None else f"mean along the flow {readable(100.0 * error, digits=2)} % off; "
     shares = "" if within is None else f"{within:.0%} of the vectors within 25 % of the true ones; "
     return [
         f"{found['vectors_valid']} of {found['vectors']} vectors valid; beside the {truth}: {mean}{shares}"
