@@ -302,8 +302,10 @@ def verdict(outcome: Outcome) -> str:
         return "refused" if failed[0].command in BEFORE_THE_WORK and not bug else "failed"
     if not outcome.faults:
         return "worked"
-    # That the data sheet is believed tells of nothing but a wrong data sheet.
-    reported = [text for text in outcome.said if outcome.wrong_value or "[no-board]" not in text]
+    # That the data sheet is believed tells of nothing but a wrong data sheet, and haze that is taken off of no fault.
+    reported = [
+        text for text in outcome.said if "[haze]" not in text and (outcome.wrong_value or "[no-board]" not in text)
+    ]
     return "warned" if reported else "silent"
 
 

@@ -246,6 +246,8 @@ def test_verdicts_and_their_summary() -> None:
     for change in ({"recall": 0.4}, {"slope_u": 1.03}, {"coverage_x": 0.7}, {"tracks": 9.0}):
         assert outcome_of(fine | change, done).verdict == "silent"
         assert outcome_of(fine | change, Step("track", 0, "", ["lfpiv: few"], 1.0)).verdict == "warned"
+    hazy = Step("track", 0, "", ["lfpiv: 18 counts are taken off [haze]"], 1.0)
+    assert outcome_of(fine | {"recall": 0.4}, hazy).verdict == "silent"
     off = {"magnification_off": -0.004, "magnification_sigma": 0.001}
     assert outcome_of(fine | off, done).faults == ["magnification -0.40 %"]
     assert outcome_of(fine | off | {"magnification_sigma": 0.002}, done).verdict == "worked"
