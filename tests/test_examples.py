@@ -102,7 +102,7 @@ def lfpiv_commands(text: str) -> Iterator[list[str]]:
 
 def test_the_commands_of_the_examples_are_understood() -> None:
     seen = set()
-    for path in sorted(EXAMPLES.iterdir()):
+    for path in sorted(filter(Path.is_file, EXAMPLES.iterdir())):
         for name, *arguments in lfpiv_commands(path.read_text()):
             if name in ("1", "--version"):
                 continue
@@ -117,7 +117,9 @@ def test_the_commands_of_the_examples_are_understood() -> None:
 
 def test_the_documents_name_every_example() -> None:
     page = (ROOT / "docs" / "clusters.md").read_text()
-    assert {path.name for path in EXAMPLES.iterdir() if f"examples/{path.name}" not in page} == set()
+    assert {
+        path.name for path in filter(Path.is_file, EXAMPLES.iterdir()) if f"examples/{path.name}" not in page
+    } == set()
 
 
 @pytest.mark.slow

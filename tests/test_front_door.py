@@ -50,7 +50,8 @@ def test_version_stands_in_one_place() -> None:
     assert PROJECT["tool"]["setuptools"]["dynamic"]["version"] == {"attr": "lfpiv_cli.__version__"}
     # a literal: setuptools then reads it without importing the package, whose dependencies a build does not have
     tree = ast.parse(Path(lfpiv_cli.__file__).read_text(encoding="utf-8"))
-    values = [node.value for node in tree.body if isinstance(node, ast.Assign) and node.targets[0].id == "__version__"]
+    assigned = [node for node in tree.body if isinstance(node, ast.Assign)]
+    values = [node.value for node in assigned if ast.unparse(node.targets[0]) == "__version__"]
     assert [ast.literal_eval(value) for value in values] == [lfpiv_cli.__version__]
     assert "version" not in yaml.safe_load((ROOT / "CITATION.cff").read_text())
 
