@@ -199,7 +199,7 @@ def compared_figure(grid: Grid, fields: Mapping[str, Floats], unit: str) -> styl
             panel.plot(right[~known], up[~known], "x", color=style.GREY, markersize=3)
             along, across_mm = of_plane[known, plane.right], of_plane[known, plane.up]
             arrows = panel.quiver(right[known], up[known], along, across_mm, **how)
-    figure.suptitle(" ")  # the room of the arrow that tells the scale
+    figure.suptitle(" ")  # room for the arrow that shows the scale
     length = float(f"{0.7 * longest:.1g}")
     place = 1.0 - 0.25 / figure.get_figheight()
     axes[0, 0].quiverkey(arrows, 0.96, place, length, f"{length:g} {unit}", coordinates="figure", labelpos="W")

@@ -163,13 +163,13 @@ class FlowStatistics(ArrayResult):
 
     def attributes(self) -> dict[str, Any]:
         """Return what a file says of them, besides what it says of their mean."""
-        told = {
+        said = {
             "pairs": self.pairs,
             "integral_time_pairs": 0.5 * self.found.tau,
             "block_pairs": self.found.block,
         }
         line = self.profile
-        return told | ({} if line is None else {"profile": line.name, "profile_components": ", ".join(line.components)})
+        return said | ({} if line is None else {"profile": line.name, "profile_components": ", ".join(line.components)})
 
     def tables(self) -> dict[str, Extra]:
         """Return the profile and the convergence, as the groups of a file; none where the time is not known."""

@@ -573,7 +573,7 @@ def _twice(values: Floats) -> list[Floats]:
 
 
 def _walls(made: Mapping[str, Any]) -> Walls | None:
-    """Return the walls that the config of a record tells of, if it is there and of this version."""
+    """Return the walls that the config of a record has, if it is there and of this version."""
     try:
         return carried_config(made, "").walls()
     except (InputError, ConfigError):

@@ -45,7 +45,7 @@ NOUNS = {
     TRAJECTORIES_FORMAT: "places of tracks",
 }
 # Arrays whose medians say most of a result; of those that it has, the first few.
-TOLD, TOLD_AT_MOST = ("velocity", "velocity_rms", "velocity_sigma", "intensity", "uncertainty_voxel", "chi2"), 3
+MEDIANS_OF, MOST_MEDIANS = ("velocity", "velocity_rms", "velocity_sigma", "intensity", "uncertainty_voxel", "chi2"), 3
 
 
 @dataclass(frozen=True)
@@ -150,7 +150,7 @@ def _described_arrays(content: Content) -> str:
         if len(places):
             extent += f"; {_reach(np.stack([places.min(axis=0), places.max(axis=0)], axis=1), reference)}"
     medians = []
-    for name in [name for name in TOLD if name in content.arrays][:TOLD_AT_MOST]:
+    for name in [name for name in MEDIANS_OF if name in content.arrays][:MOST_MEDIANS]:
         array, unit = content.arrays[name], content.units[name]
         columns = array.reshape(-1, array.shape[-1]) if content.components(name) else array.reshape(-1, 1)
         known = columns[np.isfinite(columns).all(axis=1)]
@@ -257,7 +257,7 @@ def draw(result: Result, name: str | None) -> Any:
 
 
 def _package(name: str, extra: str) -> Any:
-    """Return an optional package, by whose absence people are told which of our extras has it (UsageError)."""
+    """Return an optional package, in whose absence the error names which of our extras has it (UsageError)."""
     try:
         return import_module(name)
     except ImportError as error:
