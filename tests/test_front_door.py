@@ -5,23 +5,24 @@ from __future__ import annotations
 import ast
 import re
 import tomllib
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
+import pytest
 import yaml
+from pydantic import ValidationError
 
 import lfpiv_cli
 from lfpiv_cli.files import images
 from lfpiv_cli.files.recordings.recording import Recording
-from lfpiv_cli.files.sections import Section
-from lfpiv_cli.files.sections_work import flow_of
+from lfpiv_cli.files.sections_work import flow_of, flow_section
 from lfpiv_cli.flow.correlation import correlate
 from lfpiv_cli.flow.windows import WEIGHTINGS, CorrelationSettings
 from lfpiv_cli.grid import Grid, Reference
 from lfpiv_cli.reconstruction.registry import SOLVERS, Solver
 from lfpiv_cli.reconstruction.solvers import SolverSettings, reconstruct
-from lfpiv_cli.synthetic.flows import FLOWS
+from lfpiv_cli.synthetic.flows import FLOWS, Flow
 from tests.commands import ROOT
 
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
@@ -143,19 +144,20 @@ def test_a_camera_format_is_added_by_its_reader_and_its_line(monkeypatch, tmp_pa
     np.testing.assert_array_equal(images.read_image(tmp_path / "a.text"), image)
 
 
-class Expansion(Section):
-    kind: Literal["expansion"]
-    rate_per_s: float
-    centre_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
+def expansion(rate_per_s: float, radius_mm: float = 1.0, centre_mm: Sequence[float] = (0.0, 0.0, 0.0)) -> Flow:
+    """Expansion about a centre."""
+    return lambda points_mm: 1e-3 * rate_per_s * (points_mm - np.asarray(centre_mm))
 
 
-def test_a_flow_is_added_by_its_factory_and_its_section(monkeypatch) -> None:
-    def expansion(rate_per_s, centre_mm):
-        return lambda points_mm: 1e-3 * rate_per_s * (points_mm - np.asarray(centre_mm))
-
+def test_a_flow_is_added_by_its_factory(monkeypatch) -> None:
     monkeypatch.setitem(FLOWS, "expansion", expansion)
-    flow = flow_of(Expansion(kind="expansion", rate_per_s=2.0), Reference("mid_plane", -0.5))
+    section = flow_section(expansion)
+    assert section.__doc__ == "Expansion about a centre."
+    flow = flow_of(section(kind="expansion", rate_per_s=2.0), Reference("mid_plane", -0.5))
     np.testing.assert_allclose(flow(np.array([[1.0, 0.0, -0.5]])), [[0.002, 0.0, 0.0]])
+    for wrong in ({"radius_mm": 0.0}, {"centre_mm": (0.0, 0.0)}, {"kind": "shear"}, {"rate": 1.0}):
+        with pytest.raises(ValidationError):
+            section(**{"kind": "expansion", "rate_per_s": 2.0} | wrong)
 
 
 def test_workflow_runs_make_on_what_is_promised_and_hooks_its_checks() -> None:

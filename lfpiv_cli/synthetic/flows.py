@@ -2,7 +2,8 @@
 
 Axes: world (x, y, z), z away from the camera, in the frame of the points that are passed in; each flow is placed by its
 `centre_mm` in that frame. Points in mm, velocities in m/s, rates and gradients per second, pressures in Pa. A new flow
-is one factory, which tells it about the origin, and one line of `FLOWS`.
+is one factory, which says it about the origin, and one line of `FLOWS`: `files.sections_work.flow_section` makes the
+section of the configuration from the factory's parameters, and says of it what the factory's docstring says.
 """
 
 from __future__ import annotations
@@ -90,7 +91,9 @@ def dynamic_pressure(velocity_m_s: Floats, density_kg_m3: float) -> Floats:
 def square_duct(
     width_mm: float, mean_velocity_m_s: float, centre_mm: Sequence[float] = ORIGIN, axis: Literal["x", "y"] = "x"
 ) -> KnownFlow:
-    """Return the fully developed laminar flow along `axis` through a square duct, zero outside it.
+    """Fully developed laminar flow along `axis` (x or y) through a square duct of `width_mm`, zero outside it.
+
+    mean_velocity_m_s: the mean over its section. centre_mm: of every flow, in the volume's coordinates (default: 0).
 
     Notes
     -----
@@ -142,9 +145,10 @@ def pipe(
     centre_mm: Sequence[float] = ORIGIN,
     axis: Literal["x", "y"] | Sequence[float] = "x",
 ) -> KnownFlow:
-    """Return Poiseuille's flow along `axis` through a round pipe, u = 2 U (1 - r^2/R^2), zero outside it.
+    """Poiseuille's flow along `axis` through a round pipe of `radius_mm`, u = 2 U (1 - r^2/R^2), zero outside it.
 
-    The axis is x, y or a direction of any length, towards which the fluid flows.
+    axis: x, y or a direction [x, y, z] of any length, towards which the fluid flows. mean_velocity_m_s: U, the mean
+    over its section, half of that on its axis.
     """
     along = np.eye(3)["xyz".index(axis)] if axis in ("x", "y") else _unit(np.asarray([axis], dtype=np.float64))[0]
 
@@ -170,7 +174,7 @@ def pipe(
 def rigid_rotation(
     angular_velocity_rad_s: Sequence[float], centre_mm: Sequence[float] = ORIGIN, velocity_m_s: Sequence[float] = ORIGIN
 ) -> KnownFlow:
-    """Return omega x (r - centre) + velocity, omega in rad/s (right-handed about x, y, z), and its pressure."""
+    """Rotation as a rigid body: angular_velocity_rad_s x (r - centre_mm) + velocity_m_s, right-handed about x, y, z."""
     omega = np.asarray(angular_velocity_rad_s, dtype=np.float64)
 
     def flow(relative_mm: Floats) -> Floats:
@@ -189,7 +193,7 @@ def shear(
     centre_mm: Sequence[float] = ORIGIN,
     velocity_m_s: Sequence[float] = ORIGIN,
 ) -> KnownFlow:
-    """Return a velocity along one axis that grows by `rate_per_s` per length across, plus a uniform velocity."""
+    """A velocity along one axis that grows by `rate_per_s` across another, zero at centre_mm, plus velocity_m_s."""
     component, coordinate = "xyz".index(along), "xyz".index(across)
 
     def flow(relative_mm: Floats) -> Floats:
@@ -203,7 +207,7 @@ def shear(
 
 
 def uniform(velocity_m_s: Sequence[float]) -> KnownFlow:
-    """Return the same velocity everywhere."""
+    """The same velocity_m_s everywhere."""
     return _placed(lambda relative_mm: np.zeros((len(relative_mm), 3)), np.zeros((3, 3)), ORIGIN, velocity_m_s)
 
 
@@ -216,10 +220,10 @@ def random_modes(
     centre_mm: Sequence[float] = ORIGIN,
     velocity_m_s: Sequence[float] = ORIGIN,
 ) -> KnownFlow:
-    """Return a frozen picture of turbulence: solenoidal waves in random directions, plus a uniform velocity.
+    """A frozen picture of turbulence: so many solenoidal modes of random direction and phase, plus velocity_m_s.
 
-    Wave numbers are evenly spread in their logarithm and energies follow Kolmogorov's spectrum, E(k) ~ k^(-5/3);
-    `rms_m_s` is that of each component, over all space and all seeds.
+    Wavelengths are evenly spread in their logarithm from longest_mm to shortest_mm, and energies follow Kolmogorov's
+    spectrum, E(k) ~ k^(-5/3); rms_m_s: of each component, over all space and all seeds; seed: of the modes.
     """
     rng = np.random.default_rng(seed)
     wave = 2.0 * np.pi * np.exp(rng.uniform(-np.log(longest_mm), -np.log(shortest_mm), modes))
@@ -253,12 +257,12 @@ def taylor_green(
     third_amplitude_m_s: float | None = None,
     velocity_m_s: Sequence[float] = ORIGIN,
 ) -> KnownFlow:
-    """Return Taylor-Green vortices plus a uniform velocity; the corner where the vortices meet is the centre.
+    """Taylor-Green vortices of amplitude_m_s and wavelength_mm, plus velocity_m_s; at centre_mm four of them meet.
 
-    Plane ones, in `plane` (a, b): v_a = A sin(k a) cos(k b), v_b = -A cos(k a) sin(k b), k = 2 pi / wavelength. With a
-    third amplitude C they are three-dimensional: v_a = A sin(k a) cos(k b) cos(k c), v_b = -(A + C) cos(k a) sin(k b)
-    cos(k c), v_c = C cos(k a) cos(k b) sin(k c). Plane ones have a closed form of the pressure, if the uniform velocity
-    lies along the third axis.
+    Plane ones, in `plane` (xy, xz or yz: a, b): v_a = A sin(k a) cos(k b), v_b = -A cos(k a) sin(k b), k = 2 pi /
+    wavelength. With third_amplitude_m_s C, along the axis across the plane (null: plane ones), they are
+    three-dimensional: v_a = A sin(k a) cos(k b) cos(k c), v_b = -(A + C) cos(k a) sin(k b) cos(k c), v_c = C cos(k a)
+    cos(k b) sin(k c). Plane ones have a closed form of the pressure, if the uniform velocity lies along the third axis.
     """
     first, second = ("xyz".index(axis) for axis in plane)
     third, wave = 3 - first - second, 2.0 * np.pi / wavelength_mm
@@ -298,10 +302,10 @@ def abc(
     centre_mm: Sequence[float] = ORIGIN,
     velocity_m_s: Sequence[float] = ORIGIN,
 ) -> KnownFlow:
-    """Return the flow of Arnold, Beltrami and Childress plus a uniform velocity.
+    """The flow of Arnold, Beltrami and Childress, of amplitudes_m_s (A, B, C) and wavelength_mm, plus velocity_m_s.
 
-    For A, B, C: u = A sin(k z) + C cos(k y), v = B sin(k x) + A cos(k z), w = C sin(k y) + B cos(k x). Its vorticity is
-    k times its velocity; without the uniform velocity its pressure is Bernoulli's.
+    About centre_mm: u = A sin(k z) + C cos(k y), v = B sin(k x) + A cos(k z), w = C sin(k y) + B cos(k x). Its
+    vorticity is k times its velocity; without the uniform velocity its pressure is Bernoulli's.
     """
     of_x, of_y, of_z = amplitudes_m_s[1], amplitudes_m_s[2], amplitudes_m_s[0]
     wave = 2.0 * np.pi / wavelength_mm
@@ -330,11 +334,12 @@ def vortex_ring(
     centre_mm: Sequence[float] = ORIGIN,
     velocity_m_s: Sequence[float] = ORIGIN,
 ) -> KnownFlow:
-    """Return a frozen vortex ring about `axis` plus a uniform velocity; the fluid in its middle moves along the axis.
+    """A frozen vortex ring of radius_mm about `axis`, its core core_mm thick, plus velocity_m_s.
 
-    It is the curl of the azimuthal vector potential a rho exp(-(p^2 + z^2) / (2 core^2)), p = (rho^2 - R^2) / (2 R),
-    near the ring its distance: smooth on the axis, and gone a few cores off. At one core's distance from the middle of
-    a thin core the fluid turns with `speed_m_s`; where R is two cores, this is the speed in the ring's middle.
+    The fluid in its middle moves along the axis. It is the curl of the azimuthal vector potential
+    a rho exp(-(p^2 + z^2) / (2 core^2)), p = (rho^2 - R^2) / (2 R), near the ring its distance: smooth on the axis, and
+    gone a few cores off. At one core's distance from the middle of a thin core the fluid turns with speed_m_s; where R
+    is two cores, this is the speed in the ring's middle.
     """
     along = "xyz".index(axis)
     order = [(along + 1) % 3, (along + 2) % 3, along]
@@ -379,9 +384,9 @@ def source(
     centre_mm: Sequence[float] = ORIGIN,
     velocity_m_s: Sequence[float] = ORIGIN,
 ) -> KnownFlow:
-    """Return the flow out of a Gaussian cloud, q exp(-r^2 / (2 radius^2)) r, plus a uniform velocity.
+    """Fluid out of a Gaussian cloud of radius_mm around centre_mm, q exp(-r^2 / (2 radius^2)) r, plus velocity_m_s.
 
-    It is not solenoidal, unlike all others: `rate_per_s` is its divergence at the centre, 3 q; beyond 1.7 radii sinks
+    It is not solenoidal, unlike all others: rate_per_s is its divergence at the centre, 3 q; beyond 1.7 radii sinks
     take up the fluid.
     """
 
