@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from scipy.io import loadmat, netcdf_file
 
-from lfpiv_cli.files.exports.formats import Content, columns_of
-from lfpiv_cli.files.exports.vtk import SHOWN
+from lfpiv_cli.files.export_formats import Content, columns_of
+from lfpiv_cli.files.export_vtk import SHOWN
 from lfpiv_cli.files.particle_file import POSITION
 from lfpiv_cli.files.vtkhdf import VECTORS_FORMAT
 from lfpiv_cli.flow.field import REJECTED

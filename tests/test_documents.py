@@ -31,7 +31,7 @@ from benchmarks.__main__ import BENCHMARKS
 from lfpiv_cli.cli.main import cli
 from lfpiv_cli.errors import LimitMissedError
 from lfpiv_cli.files import calibration_file, particle_file, vtkhdf, weights_file
-from lfpiv_cli.files.exports.vtk import PLAYBACK_FORMAT, PLAYBACK_VERSION, SERIES_FORMAT, SERIES_VERSION
+from lfpiv_cli.files.export_vtk import PLAYBACK_FORMAT, PLAYBACK_VERSION, SERIES_FORMAT, SERIES_VERSION
 from lfpiv_cli.files.particle_file import (
     PARTICLES_FORMAT,
     TRACKS_FORMAT,

@@ -12,8 +12,8 @@ import pytest
 from scipy.io import loadmat, netcdf_file
 
 from lfpiv_cli.errors import InputError, OutputError, UsageError
-from lfpiv_cli.files.exports import formats
-from lfpiv_cli.files.exports.formats import FORMATS, Content, columns_of, read_content
+from lfpiv_cli.files import export_formats as formats
+from lfpiv_cli.files.export_formats import FORMATS, Content, columns_of, read_content
 from lfpiv_cli.files.particle_file import (
     OPTIONAL,
     PARTICLES_FORMAT,

@@ -15,7 +15,7 @@ from pydantic import ValidationError
 
 import lfpiv_cli
 from lfpiv_cli.files import images
-from lfpiv_cli.files.recordings.recording import Recording
+from lfpiv_cli.files.recording import Recording
 from lfpiv_cli.files.sections_work import flow_of, flow_section
 from lfpiv_cli.flow.correlation import correlate
 from lfpiv_cli.flow.windows import WEIGHTINGS, CorrelationSettings

@@ -20,7 +20,7 @@ from lfpiv_cli.optics.media import Media, equivalent_object_distance
 from lfpiv_cli.optics.surfaces import Surface
 from lfpiv_cli.optics.tracing import ObjectSpace
 from lfpiv_cli.paper.bubbles import _rows, bubbles
-from lfpiv_cli.paper.discussion import (
+from lfpiv_cli.paper.camera import (
     discussion,
     elongations_mm,
     geometric_depth_mm,

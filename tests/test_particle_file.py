@@ -8,7 +8,7 @@ import pytest
 
 from lfpiv_cli.errors import InputError, OutputError, OutputExistsError
 from lfpiv_cli.files import hdf5, particle_file
-from lfpiv_cli.files.exports.vtk import write_playback
+from lfpiv_cli.files.export_vtk import write_playback
 from lfpiv_cli.files.particle_file import (
     PARTICLES_FORMAT,
     POSITION,

@@ -23,7 +23,7 @@ from lfpiv_cli.errors import InputError, UsageError
 from lfpiv_cli.files import images
 from lfpiv_cli.files.inputs import split_part
 from lfpiv_cli.files.provenance import record, sha256
-from lfpiv_cli.files.recordings.recording import PACKED_BITS, PATTERNS, Packing, Pixels, green_of
+from lfpiv_cli.files.recording import PACKED_BITS, PATTERNS, Packing, Pixels, green_of
 from tests import camera_files
 
 

@@ -203,7 +203,7 @@ def raw_option(command: Callable[..., Any]) -> Callable[..., Any]:
     def run(raw: str | None = None, **arguments: Any) -> Any:
         if raw is None:
             return command(**arguments)
-        from lfpiv_cli.files.recordings.recording import parse_layout, with_layout
+        from lfpiv_cli.files.recording import parse_layout, with_layout
 
         parse_layout(raw)
         if arguments.get("watch"):
@@ -342,7 +342,7 @@ def common_options(command: Callable[..., dict[str, Any]]) -> Callable[..., None
     ) -> None:
         from lfpiv_cli.console import Console
         from lfpiv_cli.files.atomic import EventLog, place_of
-        from lfpiv_cli.files.recordings.recording import taken_complaints
+        from lfpiv_cli.files.recording import taken_complaints
         from lfpiv_cli.notice import Notice
 
         warned: list[Notice] = []

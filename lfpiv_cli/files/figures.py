@@ -18,7 +18,7 @@ from lfpiv_cli.files.hdf5 import RESERVED, format_of, from_attribute, member, op
 from lfpiv_cli.files.images import frames
 from lfpiv_cli.files.inputs import ensure_regular_file, split_page, split_part
 from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, TRACKS_FORMAT, TRAJECTORIES_FORMAT, open_tracks, read_points
-from lfpiv_cli.files.recordings.formats import HDF5_START
+from lfpiv_cli.files.recording_formats import HDF5_START
 from lfpiv_cli.flow.field import MM_TO_M, REJECTED, VALID, derived_fields
 
 # What `info` tells of a file of frames.

@@ -17,10 +17,11 @@ import tifffile
 from numpy.typing import NDArray
 
 from lfpiv_cli.errors import InputError, UsageError
+from lfpiv_cli.files import recording_cameras as cameras
+from lfpiv_cli.files import recording_formats as formats
 from lfpiv_cli.files.atomic import written_atomically
 from lfpiv_cli.files.inputs import ensure_regular_file, opened, split_page, split_part
-from lfpiv_cli.files.recordings import cameras, formats
-from lfpiv_cli.files.recordings.recording import LOOKS_LAID_OUT, SUFFIXES, Image, Recording, Shape, raw_frames
+from lfpiv_cli.files.recording import LOOKS_LAID_OUT, SUFFIXES, Image, Recording, Shape, raw_frames
 from lfpiv_cli.notice import written
 
 # Which formats of frames there are, how each is recognised, and what reads it.

@@ -17,8 +17,7 @@ from lfpiv_cli.files.provenance import record
 from lfpiv_cli.names import PaperPart, Size
 from lfpiv_cli.notice import written
 from lfpiv_cli.paper.bubbles import bubbles
-from lfpiv_cli.paper.camera import focal_plane, table1, table2
-from lfpiv_cli.paper.discussion import discussion
+from lfpiv_cli.paper.camera import discussion, focal_plane, table1, table2
 from lfpiv_cli.paper.faults import faults
 from lfpiv_cli.paper.parts import Findings, Row, Work, kept, read_json, rows_of
 from lfpiv_cli.paper.sensitivities import sensitivities

@@ -10,8 +10,8 @@ from typing import Any
 from lfpiv_cli.console import CONSOLE, Console
 from lfpiv_cli.errors import InputError, UsageError
 from lfpiv_cli.files.atomic import ensure_writable, written_atomically
-from lfpiv_cli.files.exports.formats import FORMATS, Content, ensure_fits, read_content, write_netcdf
-from lfpiv_cli.files.exports.vtk import write_series
+from lfpiv_cli.files.export_formats import FORMATS, Content, ensure_fits, read_content, write_netcdf
+from lfpiv_cli.files.export_vtk import write_series
 from lfpiv_cli.files.provenance import record
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.names import ExportFormat

@@ -29,7 +29,7 @@ from lfpiv_cli.files.batch import (
     pending,
 )
 from lfpiv_cli.files.config import Config, carried_config
-from lfpiv_cli.files.exports.vtk import write_playback
+from lfpiv_cli.files.export_vtk import write_playback
 from lfpiv_cli.files.pairing import in_order
 from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, Points, no_points, read_points, write_points
 from lfpiv_cli.files.provenance import even_step_s, record, sha256, with_warnings

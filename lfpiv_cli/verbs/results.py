@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lfpiv_cli.errors import UsageError
-from lfpiv_cli.files.exports.formats import Content, columns_of, content_of
+from lfpiv_cli.files.export_formats import Content, columns_of, content_of
 from lfpiv_cli.files.particle_file import (
     PARTICLES_FORMAT,
     POSITION,

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from lfpiv_cli.errors import InputError, UsageError
 from lfpiv_cli.files.inputs import content_of, ensure_regular_file, opened, reading_from, reason
-from lfpiv_cli.files.recordings.recording import (
+from lfpiv_cli.files.recording import (
     COLOUR_HINT,
     CUT,
     PACKED_BITS,

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lfpiv_cli.errors import InputError, OutputError, UsageError
-from lfpiv_cli.files.exports import vtk
+from lfpiv_cli.files import export_vtk as vtk
 from lfpiv_cli.files.hdf5 import format_of, open_h5
 from lfpiv_cli.files.particle_file import (
     PARTICLES_FORMAT,

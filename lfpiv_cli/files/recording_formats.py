@@ -24,7 +24,7 @@ import tifffile
 from lfpiv_cli.errors import InputError, LfpivError
 from lfpiv_cli.files.hdf5 import items_in, member, open_h5
 from lfpiv_cli.files.inputs import reason
-from lfpiv_cli.files.recordings.recording import (
+from lfpiv_cli.files.recording import (
     CUT,
     GREY_HINT,
     HARMLESS_BYTES,

@@ -22,7 +22,7 @@ from lfpiv_cli.files.vtkhdf import create_vtk_group, mark_active, write_root, wr
 from lfpiv_cli.grid import Reference
 
 if TYPE_CHECKING:
-    from lfpiv_cli.files.exports.formats import Content
+    from lfpiv_cli.files.export_formats import Content
 
 # VTK's XML files: images (`.vti`) and points (`.vtp`), for programs that do not read VTKHDF.
 #
