@@ -9,65 +9,40 @@ from typing import Any
 
 import click
 
-from lfpiv_cli.cli.options import (
-    CONFIGS,
-    FILE,
-    POSITIVE,
-    background_option,
-    batch_options,
-    board_option,
-    calls,
-    command,
-    common_options,
-    config_argument,
-    dark_option,
-    depth_option,
-    dt_option,
-    inputs_argument,
-    mask_option,
-    output_option,
-    pairing_options,
-    parsed_by,
-    raw_option,
-    resume_option,
-    watch_options,
-    white_option,
-    work_options,
-)
+from lfpiv_cli.cli import options
+from lfpiv_cli.cli.options import CONFIGS, FILE, POSITIVE, command, option
 from lfpiv_cli.errors import UsageError
-from lfpiv_cli.names import Divergence, GridMethod, Kept, RunMethod, Start, Weighting, names_in
-from lfpiv_cli.reconstruction.registry import SOLVER_NAMES
+from lfpiv_cli.names import Divergence, GridMethod, Kept, RunMethod, Start, Weighting
+from lfpiv_cli.reconstruction.registry import SolverName
 
 
-def particles_in(folder: Path) -> tuple[Path, ...]:
-    """Return the files of particles in a folder."""
+def particles_in(_context: click.Context, _option: click.Parameter, folder: Path | None) -> tuple[Path, ...] | None:
+    """Return the files of particles in a folder, if it is given."""
     from lfpiv_cli.files.listing import expanded
 
-    return tuple(expanded([folder], "results"))
+    return None if folder is None else tuple(expanded([folder], "results"))
 
 
 @command("field")
 @click.argument("samples", type=FILE, nargs=-1, required=True)
-@dt_option
-@click.option(
+@options.dt_option
+@option(
     "--divergence",
-    type=click.Choice(names_in(Divergence)),
-    help="Held down as far as the data ask for (penalised, the default), none (free), or not known (off).",
+    Divergence,
+    "Held down as far as the data ask for (penalised, the default), none (free), or not known (off).",
 )
-@click.option("--frame", type=click.IntRange(min=0), help="Frame of a sequence's tracks, from 0; the middle one.")
-@click.option("--derived", is_flag=True, help="Also write vorticity, divergence, strain rate, Q criterion, gradients.")
-@click.option(
-    "--at", type=FILE, help="File of points (x, y, z in mm a line); velocities there go to OUTPUT's name with _at.csv."
-)
-@click.option(
+@option("--frame", click.IntRange(min=0), "Frame of a sequence's tracks, from 0; the middle one.")
+@option("--derived", bool, "Also write vorticity, divergence, strain rate, Q criterion, gradients.")
+@option("--at", FILE, "File of points (x, y, z in mm a line); velocities there go to OUTPUT's name with _at.csv.")
+@option(
     "--pressure",
-    type=FILE,
-    callback=parsed_by(particles_in),
-    help="Folder of the particles of all frames of a sequence: the pressure is found by its tracks' accelerations.",
+    FILE,
+    "Folder of the particles of all frames of a sequence: the pressure is found by its tracks' accelerations.",
+    callback=particles_in,
 )
-@output_option("File of vectors to write (.vtkhdf).")
-@common_options
-@calls("field.fit_flow", "FieldOptions", "samples", "output")
+@options.output_option("File of vectors to write (.vtkhdf).")
+@options.common_options
+@options.calls("field.fit_flow", "FieldOptions", "samples", "output")
 def field() -> None:
     """Fit one velocity field to tracks and vectors of a flow, each weighed by its error.
 
@@ -82,32 +57,22 @@ def field() -> None:
 
 
 @command("track")
-@inputs_argument("particles", "results")
-@dt_option
-@click.option(
-    "--search",
-    "search_voxel",
-    type=POSITIVE,
-    show_default="found from the particles",
-    help="Largest displacement, voxels.",
-)
-@click.option(
+@options.inputs_argument("particles", "results")
+@options.dt_option
+@option("--search", POSITIVE, "Largest displacement, voxels.", "search_voxel", show_default="found from the particles")
+@option(
     "--shortest",
-    type=click.IntRange(min=2),
+    click.IntRange(min=2),
+    "Sequence: fewest frames of a track, shorter ones are ghosts.",
     show_default="3",
-    help="Sequence: fewest frames of a track, shorter ones are ghosts.",
 )
-@click.option("--grid", is_flag=True, help="Also write vectors on correlate's grid, as OUTPUT's name with _grid.")
-@click.option(
-    "--by",
-    type=click.Choice(names_in(GridMethod)),
-    help="With --grid: local polynomials (the default), or one field of splines, as of field.",
-)
-@pairing_options
-@batch_options
-@output_option("File of tracks to write (.vtkhdf), folder for several pairs.")
-@common_options
-@calls("track.track_particles", "TrackOptions", "particles", "output")
+@option("--grid", bool, "Also write vectors on correlate's grid, as OUTPUT's name with _grid.")
+@option("--by", GridMethod, "With --grid: local polynomials (the default), or one field of splines, as of field.")
+@options.pairing_options
+@options.batch_options
+@options.output_option("File of tracks to write (.vtkhdf), folder for several pairs.")
+@options.common_options
+@options.calls("track.track_particles", "TrackOptions", "particles", "output")
 def track() -> None:
     """Follow particles from one frame to the next, or over a sequence: particle tracking velocimetry (PTV).
 
@@ -127,30 +92,26 @@ def track() -> None:
 
 @command("follow")
 @click.argument("weights", type=FILE)
-@inputs_argument("frames")
-@dark_option
-@background_option
-@mask_option
-@dt_option
-@click.option(
+@options.inputs_argument("frames")
+@options.dark_option
+@options.background_option
+@options.mask_option
+@options.dt_option
+@option(
     "--search",
+    POSITIVE,
+    "Largest displacement from the first frame to the second, voxels.",
     "search_voxel",
-    type=POSITIVE,
     show_default="found from the particles",
-    help="Largest displacement from the first frame to the second, voxels.",
 )
-@click.option(
-    "--shortest", type=click.IntRange(min=2), default=4, help="Fewest frames of a track, shorter ones are ghosts."
-)
-@click.option(
-    "--both-ways", is_flag=True, help="Go a second time through the frames, each by its tracks before and after it."
-)
-@click.option("--residuals", is_flag=True, help="Also write what the particles leave of each image.")
-@work_options
-@output_option("Folder for the particles of each frame and the tracks.")
-@common_options
-@raw_option
-@calls("follow.follow_particles", "FollowOptions", "weights", "frames", "output")
+@option("--shortest", click.IntRange(min=2), "Fewest frames of a track, shorter ones are ghosts.", default=4)
+@option("--both-ways", bool, "Go a second time through the frames, each by its tracks before and after it.")
+@option("--residuals", bool, "Also write what the particles leave of each image.")
+@options.work_options
+@options.output_option("Folder for the particles of each frame and the tracks.")
+@options.common_options
+@options.raw_option
+@options.calls("follow.follow_particles", "FollowOptions", "weights", "frames", "output")
 def follow() -> None:
     """Find and track the particles of a time-resolved sequence together, as in Shake-The-Box.
 
@@ -197,30 +158,26 @@ def parse_windows(text: str) -> tuple[int | tuple[int, ...], ...]:
 
 
 @command("correlate")
-@inputs_argument("volumes", "results")
-@click.option("--config", type=FILE, help="In place of the config carried by the volumes.")
-@dt_option
-@click.option(
-    "--windows", callback=parsed_by(parse_windows), help="Interrogation windows in voxels, coarse to fine, as 32,16."
-)
-@click.option("--overlap", type=click.FloatRange(min=0.0, max=1.0, max_open=True), help="Of neighbouring windows.")
-@click.option(
-    "--weighting", type=click.Choice(names_in(Weighting)), help="How voxels count by their place in a window."
-)
-@pairing_options
-@click.option("--mask", "mask_volume", type=FILE, help="Volume on the same grid: voxels of 0 are left out.")
-@click.option("--ensemble", is_flag=True, help="One field of all pairs together, for a flow that does not change.")
-@click.option("--derived", is_flag=True, help="Also write vorticity, divergence, strain rate and Q criterion.")
-@click.option(
+@options.inputs_argument("volumes", "results")
+@option("--config", FILE, "In place of the config carried by the volumes.")
+@options.dt_option
+@option("--windows", parse_windows, "Interrogation windows in voxels, coarse to fine, as 32,16.")
+@option("--overlap", click.FloatRange(min=0.0, max=1.0, max_open=True), "Of neighbouring windows.")
+@option("--weighting", Weighting, "How voxels count by their place in a window.")
+@options.pairing_options
+@option("--mask", FILE, "Volume on the same grid: voxels of 0 are left out.", "mask_volume")
+@option("--ensemble", bool, "One field of all pairs together, for a flow that does not change.")
+@option("--derived", bool, "Also write vorticity, divergence, strain rate and Q criterion.")
+@option(
     "--mean",
-    type=FILE,
-    help="File of the pairs' mean and fluctuations to write (.vtkhdf); of vectors or tracks that are there, too.",
+    FILE,
+    "File of the pairs' mean and fluctuations to write (.vtkhdf); of vectors or tracks that are there, too.",
 )
-@batch_options
-@watch_options("60")
-@output_option("File for one pair, folder for several.", required=False)
-@common_options
-@calls("correlate.correlate_files", "CorrelateOptions", "volumes", "output")
+@options.batch_options
+@options.watch_options("60")
+@options.output_option("File for one pair, folder for several.", required=False)
+@options.common_options
+@options.calls("correlate.correlate_files", "CorrelateOptions", "volumes", "output")
 def correlate() -> None:
     """Measure the displacements between two volumes by multi-pass three-dimensional cross-correlation.
 
@@ -239,9 +196,9 @@ def correlate() -> None:
 @command("combine")
 @click.argument("vectors_a", type=FILE)
 @click.argument("vectors_b", type=FILE)
-@output_option("File of combined vectors to write (.vtkhdf).")
-@common_options
-@calls("combine.combine_vectors", None, "vectors_a", "vectors_b", "output")
+@options.output_option("File of combined vectors to write (.vtkhdf).")
+@options.common_options
+@options.calls("combine.combine_vectors", None, "vectors_a", "vectors_b", "output")
 def combine() -> None:
     """Weight two vector fields on one grid by their uncertainties, those of correlate and of track --grid.
 
@@ -254,25 +211,24 @@ def combine() -> None:
 
 
 @command("statistics")
-@inputs_argument("samples", "results")
-@click.option(
+@options.inputs_argument("samples", "results")
+@option(
     "--bin-mm",
-    callback=parsed_by(parse_sides),
+    parse_sides,
+    "Of tracks: sides of the bins that they are sorted into, as 1 or 1x1x2.",
     show_default="the final windows'",
-    help="Of tracks: sides of the bins that they are sorted into, as 1 or 1x1x2.",
 )
-@click.option(
-    "--fewest", type=click.IntRange(min=5), show_default="20", help="Of tracks: bins with fewer have no statistics."
-)
-@click.option(
+@option("--fewest", click.IntRange(min=5), "Of tracks: bins with fewer have no statistics.", show_default="20")
+@option(
     "--profile",
+    str,
+    "Along an axis (z), a line (z@x=0,y=1.5), or by the distance from an axis (r@x).",
     show_default="z",
-    help="Along an axis (z), a line (z@x=0,y=1.5), or by the distance from an axis (r@x).",
 )
-@resume_option
-@output_option("File of statistics to write (.vtkhdf).")
-@common_options
-@calls("statistics.statistics_of_files", "StatisticsOptions", "samples", "output")
+@options.resume_option
+@options.output_option("File of statistics to write (.vtkhdf).")
+@options.common_options
+@options.calls("statistics.statistics_of_files", "StatisticsOptions", "samples", "output")
 def statistics() -> None:
     """Mean, rms, Reynolds stresses, skewness and kinetic energy of a flow over many pairs, with standard errors.
 
@@ -292,7 +248,7 @@ def statistics() -> None:
 def named_images(command: Callable[..., Any]) -> Callable[..., Any]:
     """Let a command take its images by the option --images, too."""
 
-    @click.option("--images", "named", type=FILE, multiple=True, help="The same: images of the flow.")
+    @option("--images", FILE, "The same: images of the flow.", "named", multiple=True)
     @wraps(command)
     def run(named: tuple[Path, ...], images: tuple[Path, ...], **arguments: Any) -> Any:
         return command(images=(*named, *images), **arguments)
@@ -301,35 +257,33 @@ def named_images(command: Callable[..., Any]) -> Callable[..., Any]:
 
 
 @command("run")
-@config_argument
+@options.config_argument
 @named_images
-@inputs_argument("images")
-@white_option
-@dark_option
-@board_option
-@depth_option
-@background_option
-@mask_option
-@click.option(
-    "--method", type=click.Choice(names_in(RunMethod)), show_default="auto", help="By what the flow is measured."
-)
-@pairing_options
-@dt_option
-@click.option("--combine", is_flag=True, help="With both: also one field that weights their vectors.")
-@click.option("--follow", is_flag=True, help="Time-resolved sequence: find and track particles together.")
-@click.option(
+@options.inputs_argument("images")
+@options.white_option
+@options.dark_option
+@options.board_option
+@options.depth_option
+@options.background_option
+@options.mask_option
+@option("--method", RunMethod, "By what the flow is measured.", show_default="auto")
+@options.pairing_options
+@options.dt_option
+@option("--combine", bool, "With both: also one field that weights their vectors.")
+@option("--follow", bool, "Time-resolved sequence: find and track particles together.")
+@option(
     "--keep",
-    type=click.Choice(names_in(Kept)),
+    Kept,
+    "results: drop volumes, and particles of separate pairs, as soon as their vectors stand.",
     show_default="all",
-    help="results: drop volumes, and particles of separate pairs, as soon as their vectors stand.",
 )
-@batch_options
-@click.option("--report/--no-report", default=True, help="Make OUTPUT/report.html, a page of all of it.")
-@watch_options("by Ctrl-C")
-@output_option("Folder for all that is made.")
-@common_options
-@raw_option
-@calls("run.run", "RunOptions", "config", "output")
+@options.batch_options
+@option("--report/--no-report", bool, "Make OUTPUT/report.html, a page of all of it.", default=True)
+@options.watch_options("by Ctrl-C")
+@options.output_option("Folder for all that is made.")
+@options.common_options
+@options.raw_option
+@options.calls("run.run", "RunOptions", "config", "output")
 def run() -> None:
     """Go from raw images to vectors: calibrate, build weights, measure the flow.
 
@@ -361,33 +315,29 @@ def run() -> None:
 
 @command("reconstruct")
 @click.argument("weights", type=FILE)
-@inputs_argument("images")
-@click.option("--solver", type=click.Choice(SOLVER_NAMES), show_default=CONFIGS, help="Of volumes, or particles.")
-@click.option("--iterations", type=click.IntRange(min=1), show_default=CONFIGS, help="Steps of the solver.")
-@click.option(
-    "--relaxation",
-    type=click.FloatRange(min=0.0, min_open=True, max=2.0),
-    show_default=CONFIGS,
-    help="mu of Eq. 12.",
-)
-@click.option("--accelerate/--no-accelerate", default=None, show_default=CONFIGS, help="Extrapolate between steps.")
-@click.option("--start", type=click.Choice(names_in(Start)), show_default=CONFIGS, help="First volume.")
-@dark_option
-@background_option
-@mask_option
-@pairing_options
-@click.option(
+@options.inputs_argument("images")
+@option("--solver", SolverName, "Of volumes, or particles.", show_default=CONFIGS)
+@option("--iterations", click.IntRange(min=1), "Steps of the solver.", show_default=CONFIGS)
+@option("--relaxation", click.FloatRange(min=0.0, min_open=True, max=2.0), "mu of Eq. 12.", show_default=CONFIGS)
+@option("--accelerate/--no-accelerate", bool, "Extrapolate between steps.", default=None, show_default=CONFIGS)
+@option("--start", Start, "First volume.", show_default=CONFIGS)
+@options.dark_option
+@options.background_option
+@options.mask_option
+@options.pairing_options
+@option(
     "--residual/--no-residual",
-    default=None,
-    help="Of particles, also write what they leave of each image, as OUTPUT's name with _residual.tif; written when "
+    bool,
+    "Of particles, also write what they leave of each image, as OUTPUT's name with _residual.tif; written when "
     "not given.",
+    default=None,
 )
-@batch_options
-@watch_options("60")
-@output_option("File for one image, folder for several.")
-@common_options
-@raw_option
-@calls("reconstruct.reconstruct_files", "ReconstructOptions", "weights", "images", "output")
+@options.batch_options
+@options.watch_options("60")
+@options.output_option("File for one image, folder for several.")
+@options.common_options
+@options.raw_option
+@options.calls("reconstruct.reconstruct_files", "ReconstructOptions", "weights", "images", "output")
 def reconstruct() -> None:
     """Reconstruct the volume of tracer particles behind each image (tomographic reconstruction).
 

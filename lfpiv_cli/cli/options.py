@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable
 from functools import partial, wraps
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal, get_origin
 
 import click
 
@@ -118,37 +118,54 @@ command = partial(click.command, cls=Command)
 FILE = click.Path(path_type=Path, readable=False)
 POSITIVE = click.FloatRange(min=0.0, min_open=True)
 
+
+def option(name: str, kind: Any, text: str, *called: str, **more: Any) -> Callable[..., Any]:
+    """Return an option: a flag (`bool`), one of a kind of names, of a type of values, or what a function makes of text.
+
+    Parameters
+    ----------
+    text : its help
+    called : as in the command, where that is not its name
+    """
+    if kind is bool:
+        more["is_flag"] = True
+    elif get_origin(kind) is Literal:
+        more["type"] = click.Choice(names_in(kind))
+    elif isinstance(kind, (type, click.ParamType)):
+        more["type"] = kind
+    else:
+        more["callback"] = lambda _context, _option, given: None if given is None else kind(given)
+    return click.option(name, *called, help=text, **more)
+
+
 config_argument = click.argument("config", type=FILE)
-white_option = click.option(
-    "--white", type=FILE, multiple=True, help="White image, uniform light; twice: stopped down and not."
-)
-board_option = click.option(
+white_option = option("--white", FILE, "White image, uniform light; twice: stopped down and not.", multiple=True)
+board_option = option(
     "--board",
-    type=FILE,
+    FILE,
+    "Snapshot of the calibration target: dots, a chessboard or a ChArUco board; or several.",
     multiple=True,
-    help="Snapshot of the calibration target: dots, a chessboard or a ChArUco board; or several.",
 )
-depth_option = click.option(
+depth_option = option(
     "--depth-mm",
-    type=float,
+    float,
+    "Depth of each target in the fluid, for dlfc; without a target, of the channel's mid plane.",
     multiple=True,
-    help="Depth of each target in the fluid, for dlfc; without a target, of the channel's mid plane.",
 )
-dark_option = click.option("--dark", type=FILE, help="Dark image, taken with the cap on.")
-background_option = click.option(
-    "--background", help="Image to subtract, or minimum or mean over the images given, or as minimum:15."
+dark_option = option("--dark", FILE, "Dark image, taken with the cap on.")
+background_option = option(
+    "--background", str, "Image to subtract, or minimum or mean over the images given, or as minimum:15."
 )
-mask_option = click.option(
+mask_option = option(
     "--mask",
-    help="Image that is black where pixels are left out (reflections, bubbles), or still: where light stands still in "
+    str,
+    "Image that is black where pixels are left out (reflections, bubbles), or still: where light stands still in "
     "the images given, brighter than what moves.",
 )
-dt_option = click.option(
-    "--dt-s", type=POSITIVE, show_default="the config's, or the recording's", help="Time from one frame to the next."
+dt_option = option(
+    "--dt-s", POSITIVE, "Time from one frame to the next.", show_default="the config's, or the recording's"
 )
-resume_option = click.option(
-    "--resume", is_flag=True, help="Skip outputs that are complete and made from the same inputs."
-)
+resume_option = option("--resume", bool, "Skip outputs that are complete and made from the same inputs.")
 
 
 def inputs_argument(name: str, kind: InputKind = "images") -> Callable[..., Any]:
@@ -156,7 +173,7 @@ def inputs_argument(name: str, kind: InputKind = "images") -> Callable[..., Any]
 
     def with_inputs(command: Callable[..., Any]) -> Callable[..., Any]:
         @click.argument(name, type=FILE, nargs=-1)
-        @click.option("--files-from", type=FILE, help=f"List of more {name}, a file or folder a line; - for stdin.")
+        @option("--files-from", FILE, f"List of more {name}, a file or folder a line; - for stdin.")
         @wraps(command)
         def run(files_from: Path | None = None, **arguments: Any) -> Any:
             from lfpiv_cli.files.listing import expanded, listed
@@ -176,28 +193,24 @@ def inputs_argument(name: str, kind: InputKind = "images") -> Callable[..., Any]
     return with_inputs
 
 
-def parsed_by(parse: Callable[[Any], Any]) -> Callable[[click.Context, click.Parameter, Any], Any]:
-    """Return the callback of an option whose text is parsed by a function, if it is given."""
-    return lambda _context, _option, text: None if text is None else parse(text)
-
-
 def watch_options(unless: str) -> Callable[..., Any]:
     """Return the options of folders that are still being filled; `unless` is when they end if that is not given."""
     help_text = "The folders given are still being filled: take files as they become complete, in order."
     text = "With --watch, end so many seconds after the last change."
-    idle = click.option("--idle-s", type=POSITIVE, show_default=unless, help=text)
-    watch = click.option("--watch", is_flag=True, help=help_text)
+    idle = option("--idle-s", POSITIVE, text, show_default=unless)
+    watch = option("--watch", bool, help_text)
     return lambda command: watch(idle(command))
 
 
 def raw_option(command: Callable[..., Any]) -> Callable[..., Any]:
     """Give a command the layout of images without a header, which their names carry from here on."""
 
-    @click.option(
+    @option(
         "--raw",
-        metavar="LAYOUT",
-        help="Layout of the .raw and .bin images among those given: WIDTHxHEIGHTxBITS and options, as in "
+        str,
+        "Layout of the .raw and .bin images among those given: WIDTHxHEIGHTxBITS and options, as in "
         "2352x1768x12:packing=low-first.",
+        metavar="LAYOUT",
     )
     @wraps(command)
     def run(raw: str | None = None, **arguments: Any) -> Any:
@@ -225,51 +238,45 @@ def raw_option(command: Callable[..., Any]) -> Callable[..., Any]:
 
 def work_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """Give a command the options of all that goes through many frames."""
-    for option in (
-        click.option(
+    for each in (
+        option(
             "--dry-run",
-            is_flag=True,
-            help="Tell what would be made, how large and, by the --log of an earlier run, in which time; "
-            "write nothing.",
+            bool,
+            "Tell what would be made, how large and, by the --log of an earlier run, in which time; write nothing.",
         ),
-        click.option(
+        option(
             "--time-limit",
+            parse_time_limit,
+            "Stop before so long, as 3600, 50m or 00:50:00, with exit code 75; --resume goes on.",
             "time_limit_s",
             metavar="TIME",
-            callback=parsed_by(parse_time_limit),
-            help="Stop before so long, as 3600, 50m or 00:50:00, with exit code 75; --resume goes on.",
         ),
-        click.option(
-            "--shard",
-            metavar="I/N|slurm",
-            callback=parsed_by(Shard.parse),
-            help="Make part I of N only, or that of this job in Slurm's array.",
+        option(
+            "--shard", Shard.parse, "Make part I of N only, or that of this job in Slurm's array.", metavar="I/N|slurm"
         ),
-        click.option("--failures", type=FILE, help="File to list what failed in, with the reason (JSON)."),
-        click.option("--keep-going", is_flag=True, help="Go on with the next one when an input fails; exit 5."),
+        option("--failures", FILE, "File to list what failed in, with the reason (JSON)."),
+        option("--keep-going", bool, "Go on with the next one when an input fails; exit 5."),
         resume_option,
     ):
-        command = option(command)
+        command = each(command)
     return command
 
 
 def batch_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """Give a command the options of all batches, whose outputs workers elsewhere can make, too."""
     help_text = "Work on the workers of this Dask scheduler, or on N workers on this machine."
-    return work_options(click.option("--dask", metavar="ADDRESS|local[:N]", help=help_text)(command))
+    return work_options(option("--dask", str, help_text, metavar="ADDRESS|local[:N]")(command))
 
 
 def pairing_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """Give a command the options that say which frames belong together."""
-    how = click.option(
-        "--pairing",
-        type=click.Choice(names_in(Pairing)),
-        help="Frames belong together in separate pairs, or each with the next, by their names.",
+    how = option(
+        "--pairing", Pairing, "Frames belong together in separate pairs, or each with the next, by their names."
     )
-    template = click.option(
-        "--pair-by", help="How names tell pairs, where they do it in no usual way: img_{pair}_{frame}, or img_{number}."
+    template = option(
+        "--pair-by", str, "How names tell pairs, where they do it in no usual way: img_{pair}_{frame}, or img_{number}."
     )
-    listed = click.option("--pairs", type=FILE, help="File that lists pairs, two names a line.")
+    listed = option("--pairs", FILE, "File that lists pairs, two names a line.")
     return how(template(listed(command)))
 
 
@@ -306,13 +313,13 @@ def _flat(values: Iterable[Any]) -> list[Any]:
 
 def voice_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """Give a command, or the program before its commands, the options that say what it prints, and where."""
-    for option in (
-        click.option("--debug", is_flag=True, expose_value=False, help="Show the traceback of an error."),
+    for each in (
+        option("--debug", bool, "Show the traceback of an error.", expose_value=False),
         click.option("-q", "--quiet", is_flag=True, help="Say nothing on stderr but errors."),
         click.option("-v", "--verbose", is_flag=True, help="Say more on stderr."),
-        click.option("--json", "as_json", is_flag=True, help="Print one JSON object to stdout, warnings to stderr."),
+        option("--json", bool, "Print one JSON object to stdout, warnings to stderr.", "as_json"),
     ):
-        command = option(command)
+        command = each(command)
     return command
 
 
@@ -323,12 +330,10 @@ def common_options(command: Callable[..., dict[str, Any]]) -> Callable[..., None
     defaults of the stage's options hold.
     """
 
-    @click.option("--overwrite", is_flag=True, help="Replace outputs that exist.")
-    @click.option("--threads", type=click.IntRange(min=1), show_default="all cores", help="Threads to use.")
-    @click.option(
-        "--log", type=FILE, help="Add a line of JSON to this file for each event: start, frame, warning, end, error."
-    )
-    @click.option("--verify", type=FILE, help="Check all inputs by this list of sha256sum before any work.")
+    @option("--overwrite", bool, "Replace outputs that exist.")
+    @option("--threads", click.IntRange(min=1), "Threads to use.", show_default="all cores")
+    @option("--log", FILE, "Add a line of JSON to this file for each event: start, frame, warning, end, error.")
+    @option("--verify", FILE, "Check all inputs by this list of sha256sum before any work.")
     @voice_options
     @wraps(command)
     def run(

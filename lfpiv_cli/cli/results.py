@@ -8,27 +8,18 @@ from typing import Any, Literal, cast
 
 import click
 
-from lfpiv_cli.cli.options import (
-    FILE,
-    POSITIVE,
-    calls,
-    command,
-    common_options,
-    config_argument,
-    output_option,
-    raw_option,
-    resume_option,
-)
+from lfpiv_cli.cli import options
+from lfpiv_cli.cli.options import FILE, POSITIVE, command, option
 from lfpiv_cli.console import Console
-from lfpiv_cli.names import ExportFormat, Moment, PaperPart, names_in
+from lfpiv_cli.names import ExportFormat, Moment, PaperPart
 
 
 @command("simulate")
 @click.argument("what", type=click.Choice(["white", "board", "particles"]))
-@config_argument
-@click.option("--depth-mm", type=float, multiple=True, help="With board: in the fluid at this depth; repeatable.")
-@output_option("Folder for the images and their truth.")
-@common_options
+@options.config_argument
+@option("--depth-mm", float, "With board: in the fluid at this depth; repeatable.", multiple=True)
+@options.output_option("Folder for the images and their truth.")
+@options.common_options
 def simulate(
     what: str, config: Path, depth_mm: tuple[float, ...], output: Path, overwrite: bool, console: Console
 ) -> dict[str, Any]:
@@ -64,19 +55,17 @@ NEEDED = {"volume": ("volume", "particles", "frame")}
 @command("validate")
 @click.argument("what", type=click.Choice(list(TAKEN)))
 @click.argument("config", type=FILE, required=False)
-@click.option("--vectors", type=FILE, help="flow: vectors to judge, not those of a simulation.")
-@click.option("--volume", type=FILE, help="volume: volume to judge.")
-@click.option(
-    "--particles",
-    type=FILE,
-    help="volume, flow: true particles (.npz) to judge by; a flow that the config names comes first.",
+@option("--vectors", FILE, "flow: vectors to judge, not those of a simulation.")
+@option("--volume", FILE, "volume: volume to judge.")
+@option(
+    "--particles", FILE, "volume, flow: true particles (.npz) to judge by; a flow that the config names comes first."
 )
-@click.option("--frame", type=click.Choice(names_in(Moment)), help="volume: when in the pair it was taken.")
-@click.option("--quick", is_flag=True, help="paper: reduced sizes, at most ten minutes on two cores.")
-@click.option("--only", type=click.Choice(names_in(PaperPart)), multiple=True, help="paper: one part; repeatable.")
-@resume_option
-@output_option("Folder for the report.")
-@common_options
+@option("--frame", Moment, "volume: when in the pair it was taken.")
+@option("--quick", bool, "paper: reduced sizes, at most ten minutes on two cores.")
+@option("--only", PaperPart, "paper: one part; repeatable.", multiple=True)
+@options.resume_option
+@options.output_option("Folder for the report.")
+@options.common_options
 def validate(
     what: str, output: Path, overwrite: bool, console: Console, config: Path | None = None, **chosen: Any
 ) -> dict[str, Any]:
@@ -115,10 +104,10 @@ def validate(
 
 @command("report")
 @click.argument("folder", type=FILE)
-@click.option("--raw", type=FILE, multiple=True, help="Raw images, white ones too, to show what was found on them.")
-@output_option("Page to write (.html).")
-@common_options
-@calls("report.report", "ReportOptions", "folder", "output")
+@option("--raw", FILE, "Raw images, white ones too, to show what was found on them.", multiple=True)
+@options.output_option("Page to write (.html).")
+@options.common_options
+@options.calls("report.report", "ReportOptions", "folder", "output")
 def report() -> None:
     """Make one page of a folder of results, or of one of its files: verdict, pictures, figures, settings and warnings.
 
@@ -133,14 +122,12 @@ def report() -> None:
 
 @command("export")
 @click.argument("files", type=FILE, nargs=-1, required=True)
-@click.option("--to", type=click.Choice(names_in(ExportFormat)), required=True, help="Format to write.")
-@click.option("--plane", type=click.IntRange(min=0), help="Only this plane across z, counted from 0.")
-@click.option(
-    "--step-s", type=POSITIVE, help="Time from one file to the next; without it they are numbered 0, 1, 2, ..."
-)
-@output_option("File to write; beside FILE and named like it when not given.", required=False)
-@common_options
-@calls("export.export", "ExportOptions", "files", "output")
+@option("--to", ExportFormat, "Format to write.", required=True)
+@option("--plane", click.IntRange(min=0), "Only this plane across z, counted from 0.")
+@option("--step-s", POSITIVE, "Time from one file to the next; without it they are numbered 0, 1, 2, ...")
+@options.output_option("File to write; beside FILE and named like it when not given.", required=False)
+@options.common_options
+@options.calls("export.export", "ExportOptions", "files", "output")
 def export() -> None:
     """Write vectors, volumes, particles or tracks in the format of another program, to the last bit.
 
@@ -162,11 +149,11 @@ def export() -> None:
 
 @command("info")
 @click.argument("file", type=FILE)
-@click.option("--picture", type=FILE, help="weights: picture of one voxel's pixels to write (.png).")
-@click.option("--voxel", type=int, nargs=3, metavar="IX IY IZ", help="weights: which voxel; default the middle one.")
-@common_options
-@raw_option
-@calls("plot.info", "InfoOptions", "file")
+@option("--picture", FILE, "weights: picture of one voxel's pixels to write (.png).")
+@option("--voxel", int, "weights: which voxel; default the middle one.", nargs=3, metavar="IX IY IZ")
+@options.common_options
+@options.raw_option
+@options.calls("plot.info", "InfoOptions", "file")
 def info() -> None:
     """Describe a file that lfpiv wrote, or a recording; of weights, draw the point-spread function of one voxel.
 
@@ -179,13 +166,11 @@ def info() -> None:
 
 @command("plot")
 @click.argument("file", type=FILE)
-@output_option("PDF with a page for each figure, or PNG: one figure, or of several P_NAME.png for each.")
-@click.option("--only", multiple=True, metavar="NAME", help="This figure only; may be repeated. Default: all.")
-@click.option(
-    "--raw", type=FILE, help="Image to draw on: the raw one that particles were found in, a calibration's white image."
-)
-@common_options
-@calls("plot.plot", "PlotOptions", "file", "output")
+@options.output_option("PDF with a page for each figure, or PNG: one figure, or of several P_NAME.png for each.")
+@option("--only", str, "This figure only; may be repeated. Default: all.", multiple=True, metavar="NAME")
+@option("--raw", FILE, "Image to draw on: the raw one that particles were found in, a calibration's white image.")
+@options.common_options
+@options.calls("plot.plot", "PlotOptions", "file", "output")
 def plot() -> None:
     """Draw what is in a file: vectors, tracks, particles, a volume, a calibration or weights.
 
@@ -196,8 +181,8 @@ def plot() -> None:
 
 
 @command("warm-up")
-@click.option("--cache", type=FILE, show_default="where lfpiv keeps compiled code", help="Folder to fill.")
-@common_options
+@option("--cache", FILE, "Folder to fill.", show_default="where lfpiv keeps compiled code")
+@options.common_options
 def warm_up(overwrite: bool, console: Console, cache: Path | None = None) -> dict[str, Any]:
     """Compile all that lfpiv would compile when it is used for the first time, in a minute or two.
 

@@ -10,44 +10,26 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
-from lfpiv_cli.cli.options import (
-    CONFIGS,
-    FILE,
-    POSITIVE,
-    board_option,
-    calls,
-    command,
-    common_options,
-    config_argument,
-    dark_option,
-    depth_option,
-    output_option,
-    raw_option,
-    white_option,
-)
+from lfpiv_cli.cli import options
+from lfpiv_cli.cli.options import CONFIGS, FILE, POSITIVE, command, option
 from lfpiv_cli.console import Console
 from lfpiv_cli.errors import UsageError
-from lfpiv_cli.names import KnownCamera, Method, Refraction, Sampling, names_in
+from lfpiv_cli.names import KnownCamera, Method, Refraction, Sampling
 
 if TYPE_CHECKING:
     from lfpiv_cli.files.rig_numbers import RigNumbers
 
 
 @command("build-weights")
-@config_argument
-@click.option("--calibration", type=FILE, help="From calibrate-snapshot; without it the data sheet holds.")
-@click.option(
-    "--method",
-    type=click.Choice(names_in(Method)),
-    show_default=CONFIGS,
-    help="Equivalent, traced or fitted rays.",
-)
-@click.option("--refraction", type=click.Choice(names_in(Refraction)), show_default=CONFIGS, help="Snell's law.")
-@click.option("--sampling", type=click.Choice(names_in(Sampling)), show_default=CONFIGS, help="Integrals or rays.")
-@click.option("--dry-run", is_flag=True, help="Check everything and estimate time and memory; write nothing.")
-@output_option("Weights file to write (.h5).")
-@common_options
-@calls("build_weights.build_weights_file", "BuildWeightsOptions", "config", "output")
+@options.config_argument
+@option("--calibration", FILE, "From calibrate-snapshot; without it the data sheet holds.")
+@option("--method", Method, "Equivalent, traced or fitted rays.", show_default=CONFIGS)
+@option("--refraction", Refraction, "Snell's law.", show_default=CONFIGS)
+@option("--sampling", Sampling, "Integrals or rays.", show_default=CONFIGS)
+@option("--dry-run", bool, "Check everything and estimate time and memory; write nothing.")
+@options.output_option("Weights file to write (.h5).")
+@options.common_options
+@options.calls("build_weights.build_weights_file", "BuildWeightsOptions", "config", "output")
 def build_weights() -> None:
     """Calculate how every voxel lights every pixel: its point-spread function behind main lens and microlenses.
 
@@ -58,17 +40,17 @@ def build_weights() -> None:
 
 
 @command("calibrate-snapshot")
-@config_argument
-@white_option
-@dark_option
-@board_option
-@depth_option
-@output_option("Calibration file to write (.h5).")
-@click.option("--picture", type=FILE, help="Picture of the fitted lattice and board to write (.png).")
-@click.option("--views", type=FILE, help="Picture of views and refocused depths to write (.png).")
-@common_options
-@raw_option
-@calls("calibrate.calibrate_snapshot", "CalibrateOptions", "config", "output")
+@options.config_argument
+@options.white_option
+@options.dark_option
+@options.board_option
+@options.depth_option
+@options.output_option("Calibration file to write (.h5).")
+@option("--picture", FILE, "Picture of the fitted lattice and board to write (.png).")
+@option("--views", FILE, "Picture of views and refocused depths to write (.png).")
+@options.common_options
+@options.raw_option
+@options.calls("calibrate.calibrate_snapshot", "CalibrateOptions", "config", "output")
 def calibrate_snapshot() -> None:
     """Find microlenses and focal plane from a white image and one snapshot of a calibration target.
 
@@ -84,16 +66,16 @@ def calibrate_snapshot() -> None:
 
 
 @command("refine-calibration")
-@config_argument
+@options.config_argument
 @click.argument("images", type=FILE, nargs=-1, required=True)
-@click.option("--calibration", type=FILE, required=True, help="From calibrate-snapshot.")
-@dark_option
-@click.option("--background", type=FILE, help="Image without tracers to subtract, in place of the dark one.")
-@output_option("Corrected calibration to write (.h5); without it, only report.", required=False)
-@click.option("--picture", type=FILE, help="Picture of the particles and the walls they end at to write (.png).")
-@common_options
-@raw_option
-@calls("refine.refine_calibration", "RefineOptions", "config", "images", "calibration")
+@option("--calibration", FILE, "From calibrate-snapshot.", required=True)
+@options.dark_option
+@option("--background", FILE, "Image without tracers to subtract, in place of the dark one.")
+@options.output_option("Corrected calibration to write (.h5); without it, only report.", required=False)
+@option("--picture", FILE, "Picture of the particles and the walls they end at to write (.png).")
+@options.common_options
+@options.raw_option
+@options.calls("refine.refine_calibration", "RefineOptions", "config", "images", "calibration")
 def refine_calibration() -> None:
     """Correct a calibration by the tracers of a flow: volume self-calibration.
 
@@ -116,10 +98,10 @@ Answer = TypeVar("Answer")
 @command("init")
 @click.argument("config", type=FILE, required=False)
 @click.option("-o", "--output", type=FILE, help="File to write, in place of CONFIG; default rig.yaml.")
-@click.option("--camera", type=click.Choice(names_in(KnownCamera)), help="A published camera, nothing is asked.")
-@click.option("--from", "calibration", type=FILE, help="A calibration (.h5), whose configuration is written again.")
-@click.option("--schema", is_flag=True, help="Write the JSON schema of rig files instead, for editors.")
-@common_options
+@option("--camera", KnownCamera, "A published camera, nothing is asked.")
+@option("--from", FILE, "A calibration (.h5), whose configuration is written again.", "calibration")
+@option("--schema", bool, "Write the JSON schema of rig files instead, for editors.")
+@options.common_options
 def init(
     config: Path | None = None,
     output: Path | None = None,
@@ -161,16 +143,16 @@ def init(
 
 
 @command("check")
-@config_argument
+@options.config_argument
 @click.argument("images", type=FILE, nargs=-1)
-@click.option("--white", type=FILE, help="White image, which tells where the lens images lie.")
-@dark_option
-@click.option("--calibration", type=FILE, help="From calibrate-snapshot, in place of the data sheet.")
-@click.option("--velocity-m-s", type=POSITIVE, help="Velocity to expect; default that of the configured flow.")
-@click.option("--picture", type=FILE, help="Picture of errors and field of view by depth to write (.png).")
-@common_options
-@raw_option
-@calls("check.check", "CheckOptions", "config", "images")
+@option("--white", FILE, "White image, which tells where the lens images lie.")
+@options.dark_option
+@option("--calibration", FILE, "From calibrate-snapshot, in place of the data sheet.")
+@option("--velocity-m-s", POSITIVE, "Velocity to expect; default that of the configured flow.")
+@option("--picture", FILE, "Picture of errors and field of view by depth to write (.png).")
+@options.common_options
+@options.raw_option
+@options.calls("check.check", "CheckOptions", "config", "images")
 def check() -> None:
     """Tell what a rig and its images are good for, in seconds, before any work.
 
