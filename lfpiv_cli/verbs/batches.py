@@ -190,6 +190,10 @@ class Batch(Generic[Made]):
         """
         raise NotImplementedError
 
+    def summary(self, worked: Worked[Made]) -> dict[str, Any]:
+        """Return what is told of what became of it."""
+        return {}
+
 
 @dataclass
 class Worked(Generic[Made]):
@@ -228,6 +232,20 @@ class Worked(Generic[Made]):
             return summary
         reported = f"{len(self.failures)} of {self.total()} {unit}s failed, the first because {self.failures[0].error}"
         raise PartialError(reported, summary | {"failures": [asdict(failure) for failure in self.failures]})
+
+
+def carried_out(batch: Batch[Made], options: BatchOptions, console: Console) -> dict[str, Any]:
+    """Make what there is to make of a batch, or tell what that would be; return what is told of it.
+
+    Raises
+    ------
+    LfpivError : as `work_through`
+    PartialError : outputs could not be made, and the others were
+    """
+    if options.dry_run:
+        return dry_run(batch, options, console)
+    worked = work_through(batch, options, console)
+    return worked.ensure_whole(batch.summary(worked), batch.unit)
 
 
 def work_through(batch: Batch[Made], options: BatchOptions, console: Console) -> Worked[Made]:

@@ -288,13 +288,10 @@ class BuildWeightsOptions:
     resume: bool = False
 
 
-NO_OPTIONS = BuildWeightsOptions()
-
-
 def build_weights_file(
     config: Path,
     output: Path,
-    options: BuildWeightsOptions = NO_OPTIONS,
+    options: BuildWeightsOptions = BuildWeightsOptions(),
     *,
     overwrite: bool = False,
     console: Console = CONSOLE,

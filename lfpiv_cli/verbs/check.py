@@ -320,13 +320,10 @@ class CheckOptions:
     picture: Path | None = None
 
 
-NO_OPTIONS = CheckOptions()
-
-
 def check(
     config: Path,
     images: Sequence[Path] = (),
-    options: CheckOptions = NO_OPTIONS,
+    options: CheckOptions = CheckOptions(),
     *,
     overwrite: bool = False,
     console: Console = CONSOLE,

@@ -151,7 +151,6 @@ class CorrelateOptions(CorrelationKeys, PairBatchOptions):
     mean: Path | None = None
 
 
-NO_OPTIONS = CorrelateOptions()
 # What the mean of vectors that are there may be asked with; which belong together is then known.
 FOR_MEANS = {"mean", "derived", "resume", "pairing", "pair_by", "pairs"}
 
@@ -159,7 +158,7 @@ FOR_MEANS = {"mean", "derived", "resume", "pairing", "pair_by", "pairs"}
 def correlate_files(
     volumes: Sequence[Path],
     output: Path | None,
-    options: CorrelateOptions = NO_OPTIONS,
+    options: CorrelateOptions = CorrelateOptions(),
     *,
     overwrite: bool = False,
     console: Console = CONSOLE,

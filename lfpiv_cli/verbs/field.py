@@ -216,13 +216,10 @@ class FieldOptions:
     at: Path | None = None
 
 
-NO_OPTIONS = FieldOptions()
-
-
 def fit_flow(
     paths: Sequence[Path],
     output: Path,
-    options: FieldOptions = NO_OPTIONS,
+    options: FieldOptions = FieldOptions(),
     *,
     overwrite: bool = False,
     console: Console = CONSOLE,

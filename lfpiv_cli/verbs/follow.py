@@ -86,9 +86,6 @@ class FollowOptions(ImageOptions, WorkOptions):
     residuals: bool = False
 
 
-NO_OPTIONS = FollowOptions()
-
-
 class Way(Batch[None]):
     """One way through a sequence: the particles of each frame that can be read, in a file of its own.
 
@@ -154,7 +151,7 @@ def follow_particles(
     weights: Path,
     images: Sequence[Path],
     output: Path,
-    options: FollowOptions = NO_OPTIONS,
+    options: FollowOptions = FollowOptions(),
     *,
     overwrite: bool = False,
     console: Console = CONSOLE,

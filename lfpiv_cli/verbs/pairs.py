@@ -311,7 +311,7 @@ class PairByPair(Batch[Made]):
     def __init__(
         self,
         found: Batch[Any],
-        of_pair: Callable[[Sequence[Path], Path, Pairs, Mapping[Path, Gone]], Batch[Made]],
+        of_pair: Callable[..., Batch[Made]],
         pairs: Pairs,
         targets: Sequence[Target],
         file_bytes: float | None = None,
@@ -410,4 +410,4 @@ class PairByPair(Batch[Made]):
     def _join(self, number: int, gone: Mapping[Path, Gone]) -> Batch[Made]:
         """Return the batch of one pair: of the files of its frames, of which some may be gone, into one file."""
         paths = [self._found.targets[k].path for k in self._pairs[number]]
-        return self._of_pair(paths, self.targets[number].path, Pairs(((0, 1),)), gone)
+        return self._of_pair(paths, self.targets[number].path, pairs=Pairs(((0, 1),)), gone=gone)

@@ -280,9 +280,6 @@ class PlotOptions:
     raw: Path | None = None
 
 
-NO_OPTIONS = PlotOptions()
-
-
 def figures_of(path: Path, raw: Path | None = None) -> dict[str, Drawn]:
     """Return the figures of a file of ours, by name in the order of display; nothing is drawn yet.
 
@@ -310,7 +307,12 @@ def with_captions(figures: Figures) -> dict[str, Drawn]:
 
 
 def plot(
-    file: Path, output: Path, options: PlotOptions = NO_OPTIONS, *, overwrite: bool = False, console: Console = CONSOLE
+    file: Path,
+    output: Path,
+    options: PlotOptions = PlotOptions(),
+    *,
+    overwrite: bool = False,
+    console: Console = CONSOLE,
 ) -> dict[str, Any]:
     """Draw the figures of a file: as pages of one PDF, or as PNG, one for each.
 
@@ -360,11 +362,8 @@ class InfoOptions:
     voxel: tuple[int, int, int] | None = None
 
 
-NO_INFO_OPTIONS = InfoOptions()
-
-
 def info(
-    file: Path, options: InfoOptions = NO_INFO_OPTIONS, *, overwrite: bool = False, console: Console = CONSOLE
+    file: Path, options: InfoOptions = InfoOptions(), *, overwrite: bool = False, console: Console = CONSOLE
 ) -> dict[str, Any]:
     """Tell what is in a file of ours or of frames, its figures last; of weights, draw the column of one voxel."""
     picture, voxel = options.picture, options.voxel

@@ -32,7 +32,7 @@ from lfpiv_cli.reconstruction.images import Image, as_if_lit, filled, light
 from lfpiv_cli.reconstruction.registry import SolverName
 from lfpiv_cli.reconstruction.solvers import reconstruct as solve
 from lfpiv_cli.verbs import particles
-from lfpiv_cli.verbs.batches import Batch, BatchOptions, Expected, Worked, dry_run, work_through
+from lfpiv_cli.verbs.batches import Batch, BatchOptions, Expected, Worked, carried_out
 from lfpiv_cli.verbs.frames import (
     IMAGE,
     Bench,
@@ -170,14 +170,11 @@ class ReconstructOptions(PairOptions, ImageOptions, BatchOptions):
     residual: bool = True
 
 
-NO_OPTIONS = ReconstructOptions()
-
-
 def reconstruct_files(
     weights: Path,
     images: Sequence[Path],
     output: Path,
-    options: ReconstructOptions = NO_OPTIONS,
+    options: ReconstructOptions = ReconstructOptions(),
     *,
     overwrite: bool = False,
     console: Console = CONSOLE,
@@ -195,10 +192,7 @@ def reconstruct_files(
                 lambda group: Reconstruction(weights, group, output, options, overwrite), groups, options, console
             )
     else:
-        batch = Reconstruction(weights, images, output, options, overwrite)
-        if options.dry_run:
-            return dry_run(batch, options, console)
-        worked = work_through(batch, options, console)
+        return carried_out(Reconstruction(weights, images, output, options, overwrite), options, console)
     return worked.ensure_whole(batch.summary(worked), batch.unit)
 
 

@@ -47,14 +47,11 @@ class RefineOptions:
     picture: Path | None = None
 
 
-NO_OPTIONS = RefineOptions()
-
-
 def refine_calibration(
     config: Path,
     images: Sequence[Path],
     calibration: Path,
-    options: RefineOptions = NO_OPTIONS,
+    options: RefineOptions = RefineOptions(),
     *,
     overwrite: bool = False,
     console: Console = CONSOLE,

@@ -101,9 +101,6 @@ class ReportOptions:
     raw: Sequence[Path] = ()
 
 
-NO_OPTIONS = ReportOptions()
-
-
 @dataclass(frozen=True)
 class Contents:
     """The files of ours in a folder by what they are, and the record of each by its name in the folder.
@@ -138,7 +135,7 @@ class Contents:
 def report(
     folder: Path,
     output: Path,
-    options: ReportOptions = NO_OPTIONS,
+    options: ReportOptions = ReportOptions(),
     *,
     overwrite: bool = False,
     console: Console = CONSOLE,

@@ -25,7 +25,7 @@ from lfpiv_cli.files.shares import Deadline, awaited
 from lfpiv_cli.names import FlowMethod, Kept, RunMethod
 from lfpiv_cli.verbs import correlate as correlating
 from lfpiv_cli.verbs import track as tracking
-from lfpiv_cli.verbs.batches import ALL, BatchOptions, Failure, Stamp, Worked, stamp_of, work_through
+from lfpiv_cli.verbs.batches import ALL, BatchOptions, Failure, Stamp, carried_out, stamp_of, work_through
 from lfpiv_cli.verbs.build_weights import BuildWeightsOptions, build_weights_file
 from lfpiv_cli.verbs.calibrate import CalibrateOptions, calibrate_snapshot
 from lfpiv_cli.verbs.combine import combine_vectors
@@ -203,23 +203,13 @@ CALIBRATION, WEIGHTS, PICTURE = "calibration.h5", "weights.h5", "calibration.png
 VOLUMES, PARTICLES = ReconstructOptions(), ReconstructOptions(solver="particles")
 # What is made of the pairs of each method, by the name of the file, or of the folder of several.
 RESULTS: dict[FlowMethod, str] = {"volumes": "vectors", "particles": "tracks"}
+# And by which batch, with which options.
+BATCHES: dict[FlowMethod, tuple[type[Correlation | Tracks], Any]] = {
+    "volumes": (Correlation, CorrelateOptions()),
+    "particles": (Tracks, TrackOptions(grid=True)),
+}
 # The files of vectors by the numbers of their pairs.
 Vectors = dict[int, Path]
-
-
-def pairs_by(
-    method: FlowMethod,
-    options: Mapping[str, Any],
-    overwrite: bool,
-    files: Sequence[Path],
-    output: Path,
-    pairs: Pairs | None,
-    gone: Mapping[Path, Gone] | None = None,
-) -> Correlation | Tracks:
-    """Return the batch of pairs of volumes, or of particles."""
-    if method == "volumes":
-        return Correlation(files, output, CorrelateOptions(**options), overwrite, pairs, gone)
-    return Tracks(files, output, TrackOptions(grid=True, **options), overwrite, pairs, gone)
 
 
 class Chain:
@@ -342,12 +332,14 @@ class Chain:
 
     def _measured(self, method: FlowMethod) -> Callable[..., Correlation | Tracks]:
         """Return what makes the batch of pairs of volumes, or of particles, here or in another process."""
-        return partial(pairs_by, method, {"dt_s": self.options.dt_s, **self._resuming}, self.overwrite)
+        kind, options = BATCHES[method]
+        return partial(
+            kind, options=replace(options, dt_s=self.options.dt_s, **self._resuming), overwrite=self.overwrite
+        )
 
     def _worked(self, batch: Correlation | Tracks | Reconstruction) -> dict[str, Any]:
         """Work through a batch of which nothing fails; return what is told of it."""
-        worked: Worked[Any] = work_through(batch, self.batch_options(shared=False), self.steps.console)
-        return worked.ensure_whole(batch.summary(worked), batch.unit)
+        return carried_out(batch, self.batch_options(shared=False), self.steps.console)
 
     def _by_pairs(self, method: FlowMethod, weights: Path) -> Vectors:
         """Measure the flow in each pair, `keep` has it one after the other or all frames first."""
@@ -377,7 +369,7 @@ class Chain:
             ours = replace(self.pairs, pairs=tuple((place[first], place[second]) for first, second in pairs))
 
             def make() -> dict[str, Any]:
-                return self._worked(self._measured(method)([files[k] for k in place], output, ours))
+                return self._worked(self._measured(method)([files[k] for k in place], output, pairs=ours))
 
         made = [path for number in numbers for path in dict.fromkeys((paths[number], vectors[number]))]
         self._take(name, made, make)
@@ -396,7 +388,7 @@ class Chain:
             error = "a frame of the sequence is missing, and tracks would take those beside it for neighbours in time"
             self.failures.append(Failure(TRACKS, error))
             return {}
-        self._take("track", [tracks, *grids], lambda: self._worked(self._measured("particles")(found, tracks, None)))
+        self._take("track", [tracks, *grids], lambda: self._worked(self._measured("particles")(found, tracks)))
         return dict(enumerate(grids))
 
     def following(self, dry_run: bool = False) -> FollowOptions:

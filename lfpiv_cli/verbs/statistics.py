@@ -176,13 +176,10 @@ class StatisticsOptions:
     resume: bool = False
 
 
-NO_OPTIONS = StatisticsOptions()
-
-
 def statistics_of_files(
     files: Sequence[Path],
     output: Path,
-    options: StatisticsOptions = NO_OPTIONS,
+    options: StatisticsOptions = StatisticsOptions(),
     *,
     overwrite: bool = False,
     console: Console = CONSOLE,

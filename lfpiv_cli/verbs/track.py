@@ -26,7 +26,7 @@ from lfpiv_cli.names import GridMethod
 from lfpiv_cli.tracks.candidates import Seen, Trajectories
 from lfpiv_cli.tracks.sequences import HALVES_FRAMES
 from lfpiv_cli.verbs import checks
-from lfpiv_cli.verbs.batches import Worked, dry_run, work_through
+from lfpiv_cli.verbs.batches import Worked, carried_out
 from lfpiv_cli.verbs.fields import fields_of
 from lfpiv_cli.verbs.frames import dt_notices
 from lfpiv_cli.verbs.pairs import PairBatch, PairBatchOptions, doubts
@@ -117,23 +117,16 @@ class TrackOptions(PairBatchOptions):
     by: GridMethod = "polynomials"
 
 
-NO_OPTIONS = TrackOptions()
-
-
 def track_particles(
     particles: Sequence[Path],
     output: Path,
-    options: TrackOptions = NO_OPTIONS,
+    options: TrackOptions = TrackOptions(),
     *,
     overwrite: bool = False,
     console: Console = CONSOLE,
 ) -> dict[str, Any]:
     """Follow particles from frame to frame, in pairs or over a sequence."""
-    batch = Tracks(particles, output, options, overwrite)
-    if options.dry_run:
-        return dry_run(batch, options, console)
-    worked = work_through(batch, options, console)
-    return worked.ensure_whole(batch.summary(worked), batch.unit)
+    return carried_out(Tracks(particles, output, options, overwrite), options, console)
 
 
 @dataclass(frozen=True)
