@@ -16,17 +16,9 @@ from scipy.special import gammaincinv
 from threadpoolctl import threadpool_limits
 
 from lfpiv_cli.arrays import Flags, Floats, Integers
+from lfpiv_cli.fields import structure as structures
 from lfpiv_cli.fields.spline_field import SplineField, lattice_for, spline_field
-from lfpiv_cli.fields.structure import (
-    INDEPENDENT,
-    Samples,
-    VectorStructure,
-    between,
-    estimated,
-    estimated_slopes,
-    log_likelihood,
-    unknown_variance,
-)
+from lfpiv_cli.fields.structure import INDEPENDENT, Samples, VectorStructure
 from lfpiv_cli.robust import MAD_TO_SIGMA
 from lfpiv_cli.tracks.gridding import FEWEST_OF_STRUCTURE, ROUGH_EXPONENT, spacing_of, spread_around, without_own
 
@@ -87,7 +79,7 @@ def likeliest_structure(
     near = KDTree(places).query(places[middles], k=np.arange(1, count + 1))[1]
     points, errors, values = places[near], samples.covariance_mm2[near], samples.value_mm[near]
     about = (values - values.mean(axis=1, keepdims=True)).swapaxes(1, 2).reshape(len(near), -1)
-    unknown, spacing = unknown_variance(samples), spacing_of(places)
+    unknown, spacing = structures.unknown_variance(samples), spacing_of(places)
     variance = max(float(np.var(samples.value_mm, axis=0).mean()), np.finfo(np.float64).tiny)
     first = np.log([DIFFERENCE_SHARE * variance, NUGGET_SHARE * variance])
     lengths = np.log([INNER_SPACINGS * spacing, OUTER_SPACINGS * spacing])
@@ -95,7 +87,9 @@ def likeliest_structure(
 
     def cost(parameters: Floats, share: float) -> float:
         """Return minus the logarithm of the likelihood."""
-        found = log_likelihood(between(points, errors, _structure(parameters, spacing, share), unknown), about)
+        found = structures.log_likelihood(
+            structures.between(points, errors, _structure(parameters, spacing, share), unknown), about
+        )
         unlikely = 0.5 * float(np.sum(((parameters - guess) / DEVIATIONS) ** 2))
         return unlikely - found if np.isfinite(found) else IMPOSSIBLE
 
@@ -168,9 +162,9 @@ class KrigedField:
 
     def estimates_at(self, points_mm: Floats) -> tuple[Floats, Floats]:
         """Return displacements and their covariances at once, in the time that either takes."""
-        unknown = unknown_variance(self.samples)
+        unknown = structures.unknown_variance(self.samples)
         parts = [
-            estimated(points_mm[part], near, self.samples, self.structure, unknown)
+            structures.estimated(points_mm[part], near, self.samples, self.structure, unknown)
             for part, near in _nearest(self.samples.points_mm, points_mm, USED)
         ]
         value, covariance = (np.concatenate(each) for each in zip(*parts, strict=True))
@@ -187,9 +181,9 @@ class KrigedField:
 
     def gradient_at(self, points_mm: Floats) -> Floats:
         """Return the gradient (m, 3, 3) per mm [component, direction], each of its nearest samples held fixed."""
-        unknown = unknown_variance(self.samples)
+        unknown = structures.unknown_variance(self.samples)
         parts = [
-            estimated_slopes(points_mm[part], near, self.samples, self.structure, unknown)
+            structures.estimated_slopes(points_mm[part], near, self.samples, self.structure, unknown)
             for part, near in _nearest(self.samples.points_mm, points_mm, USED)
         ]
         return np.concatenate(parts)
@@ -259,13 +253,13 @@ def _without_outliers(samples: Samples, structure: VectorStructure, kept: Flags,
     for _ in range(rounds):
         # What each sample is off the nearest kept others by, and the covariances expected.
         others = samples.subset(kept)
-        unknown = unknown_variance(others)
+        unknown = structures.unknown_variance(others)
         number = np.where(kept, np.cumsum(kept) - 1, -1)
         count = min(USED_FOR_OUTLIERS, len(others) - 1)
         off, covariance = np.empty((len(samples), 3)), np.empty((len(samples), 3, 3))
         for part, near in _nearest(others.points_mm, samples.points_mm, count + 1):
             near = without_own(near, number[part])
-            expected, missed = estimated(samples.points_mm[part], near, others, structure, unknown)
+            expected, missed = structures.estimated(samples.points_mm[part], near, others, structure, unknown)
             off[part], covariance[part] = samples.value_mm[part] - expected, missed + own[part]
         # Which belong to the flow rather than being off by the order of their neighbours' distance.
         of_flow = np.einsum("ni,ni->n", off, np.linalg.solve(covariance, off[..., np.newaxis])[..., 0])

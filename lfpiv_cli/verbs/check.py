@@ -28,19 +28,10 @@ from lfpiv_cli.particles.view import raw_view
 from lfpiv_cli.reconstruction.images import FULL_SCALES, Mask, defects, light, saturated
 from lfpiv_cli.validation import planning
 from lfpiv_cli.validation.planning import share_beyond
+from lfpiv_cli.verbs import planning as of_rigs
 from lfpiv_cli.verbs.calibrate import NO_BOARD, calibration_notices, calibration_of, photographs
 from lfpiv_cli.verbs.checks import Line, Verdict, word_of, worst
-from lfpiv_cli.verbs.planning import (
-    Bench,
-    bench_of,
-    by_depth,
-    by_which_light,
-    error_verdict,
-    graded,
-    rig_figures,
-    rig_lines,
-    seeding_line,
-)
+from lfpiv_cli.verbs.planning import Bench
 from lfpiv_cli.weights.build import default_padding
 from lfpiv_cli.weights.lens_cells import aligned
 
@@ -212,7 +203,7 @@ def _light(_bench: Bench, seen: Seen) -> Line:
         f"{seen.name}: bright pixels stand {signal:.0f} times the noise of {written(seen.noise, 2)} counts above the "
         "background"
     )
-    verdict = graded(signal, GOOD_SIGNAL, LEAST_SIGNAL)
+    verdict = of_rigs.graded(signal, GOOD_SIGNAL, LEAST_SIGNAL)
     return Line("light", verdict, reason + {"look": ": more light", "no": ": no tracers are seen"}.get(verdict, ""))
 
 
@@ -267,7 +258,7 @@ def _beyond(bench: Bench, seen: Seen) -> Line:
     low, high = bench.bounds_mm[2]
     share = share_beyond(bench.camera, bench.media, (float(low), float(high)), np.maximum(picture, np.float32(0.0)))
     reason = f"{seen.name}: {share:.0%} of the light in its middle comes from before or behind the volume"
-    verdict = graded(share, GOOD_BEYOND, MOST_BEYOND)
+    verdict = of_rigs.graded(share, GOOD_BEYOND, MOST_BEYOND)
     return Line(about, verdict, reason + ("" if verdict == "good" else ": a deeper volume, or thinner illumination"))
 
 
@@ -278,7 +269,7 @@ def _tracers(bench: Bench, seen: Seen, number: float) -> Line:
     if not np.isfinite(number):
         reason = "hardly a pixel is dark: two tracers per microlens or more, or haze; volumes err less than particles"
         return Line("tracers", "look", f"{seen.name}: {reason}")
-    line = seeding_line(bench, number, "in the image")
+    line = of_rigs.seeding_line(bench, number, "in the image")
     return replace(line, about="tracers", reason=f"{seen.name}: {line.reason}")
 
 
@@ -293,9 +284,9 @@ def _precision(bench: Bench, seen: Seen, tracer_light: float) -> Line:
     reason = (
         f"{seen.name}: a tracer alone of {written(tracer_light, 2)} counts, as here, is placed to "
         f"{written(1e3 * errors[0], 2)} um across and {written(1e3 * errors[2], 2)} um in depth at best, "
-        f"{by_which_light(bench)}"
+        f"{of_rigs.by_which_light(bench)}"
     )
-    return Line(about, error_verdict(bench, errors[2]), reason)
+    return Line(about, of_rigs.error_verdict(bench, errors[2]), reason)
 
 
 QUESTIONS: Sequence[Callable[[Bench, Seen], Line]] = (_exposure, _light, _background, _lens_images, _beyond)
@@ -343,14 +334,14 @@ def check(
     found = None if options.calibration is None else open_calibration(options.calibration)
     of_white, lines = lattice_of(settings, pictures)
     found = found or of_white
-    bench = bench_of(settings, found, options.velocity_m_s)
-    lines = [*rig_lines(bench), *lines]
-    figures = rig_figures(bench)
+    bench = of_rigs.bench_of(settings, found, options.velocity_m_s)
+    lines = [*of_rigs.rig_lines(bench), *lines]
+    figures = of_rigs.rig_figures(bench)
     if images:
         of_images, measured = image_lines(bench, pictures, found)
         lines, figures = [*lines, *of_images], figures | measured
     if options.picture is not None:
         from lfpiv_cli.pictures.calibration import planning_figure
 
-        write_picture(options.picture, planning_figure(by_depth(bench), bench.bounds_mm), overwrite)
+        write_picture(options.picture, planning_figure(of_rigs.by_depth(bench), bench.bounds_mm), overwrite)
     return {"verdicts": [asdict(line) for line in lines], **figures, "verdict": worst(lines)}

@@ -20,13 +20,7 @@ from lfpiv_cli.files.particle_file import Points, matrices
 from lfpiv_cli.files.provenance import record
 from lfpiv_cli.flow import field as vector_field
 from lfpiv_cli.flow.combining import WindowGrid, without_tracks
-from lfpiv_cli.flow.field import (
-    MM_TO_M,
-    REJECTED,
-    Derived,
-    VectorField,
-    derived_from,
-)
+from lfpiv_cli.flow.field import MM_TO_M, REJECTED, Derived, VectorField, derived_from
 from lfpiv_cli.flow.windows import ParallelWalls
 from lfpiv_cli.grid import FOCAL_POINT, Reference
 from lfpiv_cli.names import Divergence

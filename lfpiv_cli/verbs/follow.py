@@ -19,15 +19,7 @@ from lfpiv_cli.console import CONSOLE, Console, Frames
 from lfpiv_cli.errors import InputError, UsageError
 from lfpiv_cli.files import images as image_files
 from lfpiv_cli.files.atomic import ensure_writable
-from lfpiv_cli.files.batch import (
-    VTKHDF_SUFFIX,
-    Frame,
-    Target,
-    frames_of,
-    images_seen,
-    output_paths,
-    pending,
-)
+from lfpiv_cli.files.batch import VTKHDF_SUFFIX, Frame, Target, frames_of, images_seen, output_paths, pending
 from lfpiv_cli.files.config import Config, carried_config
 from lfpiv_cli.files.export_vtk import write_playback
 from lfpiv_cli.files.pairing import in_order
@@ -39,22 +31,12 @@ from lfpiv_cli.grid import Reference
 from lfpiv_cli.notice import Notice
 from lfpiv_cli.particles.neighbour_frames import STEPS as PREDICTED_STEPS
 from lfpiv_cli.tracks.candidates import Trajectories
+from lfpiv_cli.verbs import frames as of_frames
 from lfpiv_cli.verbs import particles
 from lfpiv_cli.verbs.batches import ALL, Batch, BatchOptions, Failure, WorkOptions, dry_run, work_through
 from lfpiv_cli.verbs.checks import few_notices
 from lfpiv_cli.verbs.following import SHORTEST, BothWays, Forwards, Recorded, ensure_sequence
-from lfpiv_cli.verbs.frames import (
-    ImageOptions,
-    bench_of,
-    check_frame,
-    frame_notices,
-    frames_dt_notices,
-    mask_of,
-    other_frames,
-    read_frame,
-    reader,
-    residual_path,
-)
+from lfpiv_cli.verbs.frames import ImageOptions
 from lfpiv_cli.verbs.particles import open_weights_that_fit, searchable_weights
 from lfpiv_cli.verbs.reconstruct import file_notices
 from lfpiv_cli.verbs.tracers import size_notices
@@ -113,7 +95,7 @@ class Way(Batch[None]):
     def ensure_residuals(self, numbers: Sequence[int]) -> None:
         """Refuse residual images that could not be written."""
         for number in numbers if self.residuals else ():
-            ensure_writable(residual_path(self.targets[number].path), self._replace, self.inputs)
+            ensure_writable(of_frames.residual_path(self.targets[number].path), self._replace, self.inputs)
 
     def begin(self, numbers: Sequence[int], console: Console) -> float:
         """Return the steps of a frame: only the first two are searched from nothing."""
@@ -132,7 +114,7 @@ class Way(Batch[None]):
             raise
         work.console.warn(notices)
         if self.residuals:
-            image_files.write_tiff(residual_path(target.path), left, overwrite=True)
+            image_files.write_tiff(of_frames.residual_path(target.path), left, overwrite=True)
         reported = replace(points, provenance=with_warnings(target.record, [*self.said, *notices]))
         write_points(target.path, PARTICLES_FORMAT, reported, overwrite=self._replace)
 
@@ -180,7 +162,7 @@ def follow_particles(
         steps = [before.seconds_to(after) for before, after in pairwise(frames)]
         names = [f"{each.path} page {each.page}" for each in frames]
         settings = settings.overridden("correlation", dt_s=even_step_s(steps, names))
-    console.warn(frames_dt_notices(settings.correlation.dt_s, frames))
+    console.warn(of_frames.frames_dt_notices(settings.correlation.dt_s, frames))
     tracking = tracking_of(settings, options.search_voxel, options.shortest, len(frames), str(weights))
     left_out: list[Failure] = []
     if options.keep_going:
@@ -201,10 +183,7 @@ def follow_particles(
     sequence, said = _recorded(weights, content, settings, tracking, frames, ways[0], options, console)
 
     chosen = BatchOptions(
-        resume=options.resume,
-        keep_going=options.keep_going,
-        time_limit_s=options.time_limit_s,
-        begun_s=options.begun_s,
+        resume=options.resume, keep_going=options.keep_going, time_limit_s=options.time_limit_s, begun_s=options.begun_s
     )
     forwards = Forwards(sequence, ways[0].read)
     found: Trajectories | None = None
@@ -233,16 +212,18 @@ def _recorded(
     content, shape = searchable_weights(weights, content, settings), content.image_shape
     dark = options.dark_image(shape)
     pitch_px = float(content.camera.micro_image_lattice_px().pitch.max())
-    bench = bench_of(content, settings, dark, mask_of(options.mask, frames, shape, pitch_px, options.keep_going))
-    read = reader(options.level, frames, shape, dark, options.keep_going)
+    bench = of_frames.bench_of(
+        content, settings, dark, of_frames.mask_of(options.mask, frames, shape, pitch_px, options.keep_going)
+    )
+    read = of_frames.reader(options.level, frames, shape, dark, options.keep_going)
     bench, size = particles.sized(bench, (particles.frame_of(bench, *read(k)) for k in way.order))
     said = size_notices(settings, size)
     console.warn(said)
 
     def frame_at(number: int) -> particles.Frame:
         (raw, lit), stem = read(number), frames[number].stem
-        check_frame(bench, raw, str(frames[number].path))
-        console.warn([*file_notices(way.targets[number].record, stem), *frame_notices(bench, raw, lit, stem)])
+        of_frames.check_frame(bench, raw, str(frames[number].path))
+        console.warn([*file_notices(way.targets[number].record, stem), *of_frames.frame_notices(bench, raw, lit, stem)])
         return particles.frame_of(bench, raw, lit)
 
     return Recorded(bench, size, tracking, frame_at, [frame.stem for frame in frames], {}), said
@@ -256,7 +237,7 @@ def _readable(frames: Sequence[Frame], shape: tuple[int, int]) -> tuple[list[Fra
     seen: list[Frame] = []
     for frame in frames:
         try:
-            raw, fault = read_frame(frame, shape), None
+            raw, fault = of_frames.read_frame(frame, shape), None
         except InputError as error:
             fault = str(error)
         else:
@@ -305,7 +286,7 @@ def _ways(
     These say which frames each is made with: on the way forwards those before it (the first with the second), the
     second time all.
     """
-    common, words = options.files(given[0]), other_frames(options.level, frames, options.mask)
+    common, words = options.files(given[0]), of_frames.other_frames(options.level, frames, options.mask)
     every = ["left out\n" if frame.fault else f"{sha256(frame.path)} {frame.page}\n" for frame in frames]
     resolved, there = settings.resolved(), [number for number, frame in enumerate(frames) if frame.fault is None]
 

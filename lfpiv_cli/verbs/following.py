@@ -20,29 +20,13 @@ from lfpiv_cli.particles.neighbour_frames import Predicted, find_predicted
 from lfpiv_cli.particles.rounds import first_pass
 from lfpiv_cli.particles.search import Particles, blank, rebuilt, result
 from lfpiv_cli.reconstruction.images import Image, light
+from lfpiv_cli.tracks import sequences
 from lfpiv_cli.tracks.candidates import Seen, Trajectories, long_ones
-from lfpiv_cli.tracks.sequences import (
-    PAST_FRAMES,
-    REACH_FRAMES,
-    PartialTracks,
-    Prediction,
-    begun,
-    expected_in,
-    extended,
-)
+from lfpiv_cli.tracks.sequences import PAST_FRAMES, REACH_FRAMES, PartialTracks, Prediction
+from lfpiv_cli.verbs import particles as of_particles
 from lfpiv_cli.verbs.checks import few_notices
 from lfpiv_cli.verbs.frames import Bench, Progress, bench_of, check_frame, frame_notices, given_picture, picture_for
-from lfpiv_cli.verbs.particles import (
-    Frame,
-    find_beside,
-    find_first,
-    frame_of,
-    points_of,
-    searchable,
-    sized,
-    task_for,
-    what_is_left,
-)
+from lfpiv_cli.verbs.particles import Frame
 from lfpiv_cli.verbs.tracers import TracerSize, light_notices, size_notices
 from lfpiv_cli.verbs.tracks import Tracked, Tracking, seen_in, tracked, tracking_of
 
@@ -118,18 +102,20 @@ def follow(
     carried = carried_config(weights.provenance, "the weights").overridden("correlation", dt_s=dt_s)
     chosen = carried.overridden("reconstruction", **(settings | {"solver": "particles"}))
     tracking = tracking_of(chosen, search_voxel, shortest, len(images), "the weights")
-    bench = bench_of(searchable(weights, chosen), chosen, given_picture(weights, dark), given_picture(weights, mask))
+    bench = bench_of(
+        of_particles.searchable(weights, chosen), chosen, given_picture(weights, dark), given_picture(weights, mask)
+    )
     level = given_picture(weights, background)
     names = [f"image {number}" for number in range(len(images))]
     pictures = [picture_for(weights, image) for image in images]
 
     def frame(number: int) -> Frame:
-        return frame_of(bench, pictures[number], light(pictures[number], bench.dark, level))
+        return of_particles.frame_of(bench, pictures[number], light(pictures[number], bench.dark, level))
 
     for name, raw in zip(names, pictures, strict=True):
         check_frame(bench, raw, name)
         warn_of(frame_notices(bench, raw, light(raw, bench.dark, level), name))
-    bench, size = sized(bench, (frame(number) for number in range(len(images))))
+    bench, size = of_particles.sized(bench, (frame(number) for number in range(len(images))))
     warn_of(size_notices(chosen, size))
     provenance = record("follow", chosen.resolved() | tracking.reported(), {})
     sequence = Recorded(bench, size, tracking, frame, names, provenance)
@@ -208,8 +194,8 @@ class Forwards:
         if number < 2:
             if not self._first_two:
                 two = [sequence.frame(k) for k in range(2)]
-                own = [find_first(bench, each, progress) for each in two]
-                self._first_two = [find_beside(bench, two[k], own[k], [own[1 - k]]) for k in range(2)]
+                own = [of_particles.find_first(bench, each, progress) for each in two]
+                self._first_two = [of_particles.find_beside(bench, two[k], own[k], [own[1 - k]]) for k in range(2)]
             return _made(sequence, number, frame, self._first_two[number], [])
         return _made(sequence, number, frame, *_next(sequence, number, frame, self._up_to(number).ahead, progress))
 
@@ -224,9 +210,9 @@ class Forwards:
             recent[k] = seen_in(self._read(k))
             recent.pop(k - LOOKED_BACK, None)
             if partial is None:
-                partial = begun(recent)
+                partial = sequences.begun(recent)
             else:
-                partial = extended(partial, recent, tracking.search_mm, tracking.scale)
+                partial = sequences.extended(partial, recent, tracking.search_mm, tracking.scale)
         if partial is None:
             raise ValueError("a sequence has frames")
         self._so_far = partial
@@ -255,10 +241,10 @@ class BothWays:
         sequence, bench, before = self._sequence, self._sequence.bench, self._recent
         near = range(max(number - REACH_FRAMES, 0), min(number + REACH_FRAMES + 1, len(sequence.names)))
         self._recent = {k: before[k] if k in before else seen_in(self._forward(k)) for k in near}
-        frame, ahead = sequence.frame(number), expected_in(self._confirmed, self._recent, number)
+        frame, ahead = sequence.frame(number), sequences.expected_in(self._confirmed, self._recent, number)
         if len(ahead.light):
             return _made(sequence, number, frame, *_next(sequence, number, frame, ahead, progress))
-        points, task = self._forward(number), task_for(bench, frame)
+        points, task = self._forward(number), of_particles.task_for(bench, frame)
         rows = _rows(bench, points.position_mm, points.arrays["intensity"])
         residual = rebuilt(task, blank(task), rows).residual.reshape(frame.image.shape)
         return points, np.where(frame.unusable, 0.0, residual).astype(np.float32), []
@@ -268,7 +254,7 @@ def _next(
     sequence: Recorded, number: int, frame: Frame, ahead: Prediction, progress: Progress | None
 ) -> tuple[Particles, list[Notice]]:
     """Return the particles of a frame where they are ahead of those before it, and of the rest; what is said of it."""
-    bench, task = sequence.bench, task_for(sequence.bench, frame)
+    bench, task = sequence.bench, of_particles.task_for(sequence.bench, frame)
     known = np.isfinite(ahead.sigma_mm).all(axis=1)
     sigma = np.abs(bench.content.camera.to_image_axes(ahead.sigma_mm[known]))
     rows = _rows(bench, ahead.position_mm[known], ahead.light[known])
@@ -288,6 +274,6 @@ def _rows(bench: Bench, position_mm: Floats, light_counts: Floats) -> Floats:
 
 def _made(sequence: Recorded, number: int, frame: Frame, found: Particles, notices: list[Notice]) -> Found:
     """Return what was found in a frame as it is kept."""
-    points = points_of(sequence.bench, frame, found, sequence.size, sequence.provenance)
+    points = of_particles.points_of(sequence.bench, frame, found, sequence.size, sequence.provenance)
     notices = [*notices, *light_notices(points, sequence.names[number])]
-    return points, np.asarray(what_is_left(frame, found), np.float32), notices
+    return points, np.asarray(of_particles.what_is_left(frame, found), np.float32), notices

@@ -31,18 +31,9 @@ from lfpiv_cli.files.inputs import given
 from lfpiv_cli.files.provenance import seconds_between, sha256
 from lfpiv_cli.files.weights_file import WeightsFile
 from lfpiv_cli.notice import Notice, written
+from lfpiv_cli.reconstruction import images as of_images
 from lfpiv_cli.reconstruction.haze import Haze, white_of
-from lfpiv_cli.reconstruction.images import (
-    Image,
-    Mask,
-    defects,
-    light,
-    mean_background,
-    minimum_background,
-    saturated,
-    still_light,
-    touched,
-)
+from lfpiv_cli.reconstruction.images import Image, Mask
 from lfpiv_cli.reconstruction.solvers import Normalisers, Operator, normalisers
 from lfpiv_cli.robust import HALF_NORMAL_MEDIAN, MAD_TO_SIGMA
 
@@ -55,7 +46,7 @@ Read = Callable[[int], tuple[Image, Image]]
 
 # In place of a mask's file: what does not move in the frames is left out.
 STILL = "still"
-BACKGROUNDS = {"minimum": minimum_background, "mean": mean_background}
+BACKGROUNDS = {"minimum": of_images.minimum_background, "mean": of_images.mean_background}
 
 
 @dataclass(frozen=True)
@@ -155,7 +146,7 @@ def reader(
     def read(number: int) -> tuple[Image, Image]:
         numbers = level.around(number, len(frames))
         raw = page(number)
-        return raw, light(raw, dark, over(numbers) if level.kind else fixed)
+        return raw, of_images.light(raw, dark, over(numbers) if level.kind else fixed)
 
     return read
 
@@ -188,7 +179,7 @@ def mask_of(
     if mask != STILL:
         return image_files.read_reference(Path(mask), shape)
     images = readable(lambda number: read_frame(frames[number], shape), range(len(frames)), keep_going)
-    still = still_light(images, pitch_px)
+    still = of_images.still_light(images, pitch_px)
     return np.where(still, np.float32(0.0), np.float32(1.0))
 
 
@@ -276,14 +267,14 @@ class Bench:
 
     def unusable(self, raw: Image) -> Mask:
         """Return which pixels of a raw frame take no part."""
-        return np.asarray(self.lasting | saturated(raw, self.settings.reconstruction.saturation_counts))
+        return np.asarray(self.lasting | of_images.saturated(raw, self.settings.reconstruction.saturation_counts))
 
     def excluded_with(self, unusable: Mask) -> Mask:
         """Return which pixels in the weights' frame take no part in a frame with unusable raw pixels."""
         too_bright = unusable & ~self.lasting
         if not too_bright.any():
             return self.excluded
-        return self.excluded | touched(too_bright, self.content.weights.prepare)
+        return self.excluded | of_images.touched(too_bright, self.content.weights.prepare)
 
     def haze_in(self, lit: Image, unusable: Mask) -> Haze | None:
         """Return the haze in a raw frame with dark or background taken off; None: none, or none that is certain.
@@ -320,12 +311,12 @@ def bench_of(
         No pixel is left.
     """
     weights = content.weights
-    lasting = np.zeros(weights.image_shape, np.bool_) if dark is None else defects(dark)
+    lasting = np.zeros(weights.image_shape, np.bool_) if dark is None else of_images.defects(dark)
     if mask is not None:
         lasting |= mask == 0.0
     if lasting.all():
         raise InputError("mask and dark image leave out all pixels; a mask is black only where nothing is believed")
-    excluded = touched(lasting, weights.prepare) if lasting.any() else np.zeros(weights.image_shape, np.bool_)
+    excluded = of_images.touched(lasting, weights.prepare) if lasting.any() else np.zeros(weights.image_shape, np.bool_)
     if weights.calibration is not None:
         excluded |= ~weights.calibration.rectification.inside
     if earlier is not None and earlier.content is content and np.array_equal(earlier.excluded, excluded):

@@ -163,11 +163,7 @@ class FlowStatistics(ArrayResult):
 
     def attributes(self) -> dict[str, Any]:
         """Return what a file says of them, besides what it says of their mean."""
-        said = {
-            "pairs": self.pairs,
-            "integral_time_pairs": 0.5 * self.found.tau,
-            "block_pairs": self.found.block,
-        }
+        said = {"pairs": self.pairs, "integral_time_pairs": 0.5 * self.found.tau, "block_pairs": self.found.block}
         line = self.profile
         return said | ({} if line is None else {"profile": line.name, "profile_components": ", ".join(line.components)})
 

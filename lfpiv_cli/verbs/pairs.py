@@ -23,19 +23,8 @@ from lfpiv_cli.files.provenance import Gone, carried_record, sha256, without_war
 from lfpiv_cli.files.shares import awaited
 from lfpiv_cli.names import InputKind, Pairing
 from lfpiv_cli.notice import Notice
-from lfpiv_cli.verbs.batches import (
-    ALL,
-    Batch,
-    BatchOptions,
-    Expected,
-    Failure,
-    Made,
-    Stamp,
-    Worked,
-    WorkOptions,
-    stamp_of,
-    work_through,
-)
+from lfpiv_cli.verbs import batches
+from lfpiv_cli.verbs.batches import ALL, Batch, BatchOptions, Expected, Failure, Made, Stamp, Worked, WorkOptions
 from lfpiv_cli.verbs.frames import residual_path
 
 
@@ -248,7 +237,7 @@ def work_as_they_come(
                 raise
             together.failures.append(Failure(group[0].stem, str(error)))
         else:
-            together.add(work_through(batch, alone, console))
+            together.add(batches.work_through(batch, alone, console))
     together.failures[:0] = left_out
     if batch is None:
         raise InputError(f"{together.failures[0].name}: {together.failures[0].error}")
@@ -337,7 +326,7 @@ class PairByPair(Batch[Made]):
         every = list(dict.fromkeys(k for number in numbers for k in self._pairs[number]))
         frames = [self._found.targets[k] for k in every]
         left = [every[k] for k in pending(frames, self.inputs, self.overwrite, resume=True)] if every else []
-        self._whole = {k: stamp_of(self._found.targets[k].path) for k in set(every) - set(left)}
+        self._whole = {k: batches.stamp_of(self._found.targets[k].path) for k in set(every) - set(left)}
         steps = self._found.begin(left, console)
         self._drop(range(len(self._found.targets)))
         # Where all frames are there, what joins them is a step.
@@ -347,12 +336,12 @@ class PairByPair(Batch[Made]):
         """Make the files of two frames, where they are not there, and of these the result."""
         for k in self._pairs[number]:
             target = self._found.targets[k]
-            stamp = stamp_of(target.path)
+            stamp = batches.stamp_of(target.path)
             if stamp is None or self._whole.get(k) != stamp:
                 with awaited(target.path):
                     if state_or_none(target) is not State.COMPLETE:
                         self._found.make(k, work)
-                self._whole[k] = stamp_of(target.path)
+                self._whole[k] = batches.stamp_of(target.path)
         joined = self._join(number, {})
         joined.begin([0], work.console)
         made = joined.make(0, work)

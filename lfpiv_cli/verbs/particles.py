@@ -36,17 +36,8 @@ from lfpiv_cli.particles.view import Light, View, ensure_square_cells, raw_view
 from lfpiv_cli.reconstruction.haze import Haze
 from lfpiv_cli.reconstruction.images import Image, Mask, filled, light
 from lfpiv_cli.reconstruction.solvers import Normalisers
-from lfpiv_cli.verbs.frames import (
-    IMAGE,
-    Bench,
-    Progress,
-    Read,
-    bench_of,
-    check_frame,
-    frame_notices,
-    given_picture,
-    picture_for,
-)
+from lfpiv_cli.verbs import frames as of_frames
+from lfpiv_cli.verbs.frames import IMAGE, Bench, Progress, Read, check_frame
 from lfpiv_cli.verbs.tracers import Diffusion, TracerSize, light_notices, size_notices
 from lfpiv_cli.weights.build import factorise_bricks
 from lfpiv_cli.weights.columns import OnDemandOperator
@@ -101,11 +92,16 @@ def find_particles(
     """
     carried = carried_config(weights.provenance, "the weights")
     chosen = carried.overridden("reconstruction", **(settings | {"solver": "particles"}))
-    bench = bench_of(searchable(weights, chosen), chosen, given_picture(weights, dark), given_picture(weights, mask))
-    level = given_picture(weights, background)
-    raws = [picture_for(weights, each) for each in (image, *neighbours)]
+    bench = of_frames.bench_of(
+        searchable(weights, chosen),
+        chosen,
+        of_frames.given_picture(weights, dark),
+        of_frames.given_picture(weights, mask),
+    )
+    level = of_frames.given_picture(weights, background)
+    raws = [of_frames.picture_for(weights, each) for each in (image, *neighbours)]
     check_frame(bench, raws[0], IMAGE)
-    notices = frame_notices(bench, raws[0], light(raws[0], bench.dark, level), IMAGE)
+    notices = of_frames.frame_notices(bench, raws[0], light(raws[0], bench.dark, level), IMAGE)
     frame, *others = (frame_of(bench, raw, light(raw, bench.dark, level)) for raw in raws)
     bench, size = sized(bench, (frame, *others))
     if others:
@@ -494,7 +490,7 @@ class Prepared:
 
     def bench(self, content: WeightsFile, settings: Config, dark: Image | None, mask: Image | None) -> Bench:
         """Return what all frames share, with the sums of the last one where these are the same."""
-        self._bench = bench_of(content, settings, dark, mask, earlier=self._bench)
+        self._bench = of_frames.bench_of(content, settings, dark, mask, earlier=self._bench)
         return self._bench
 
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from lfpiv_cli.calibration.model import Calibration
 from lfpiv_cli.console import CONSOLE, Console
 from lfpiv_cli.errors import ConfigError, InputError, UsageError
-from lfpiv_cli.files import calibration_file, vtkhdf, weights_file
+from lfpiv_cli.files import calibration_file, particle_file, vtkhdf, weights_file
 from lfpiv_cli.files.atomic import ensure_writable
 from lfpiv_cli.files.calibration_file import open_calibration
 from lfpiv_cli.files.config import carried_config
@@ -24,14 +24,7 @@ from lfpiv_cli.files.hdf5 import format_of
 from lfpiv_cli.files.images import read_single
 from lfpiv_cli.files.inputs import given
 from lfpiv_cli.files.pages import ensure_drawing, write_pdf, write_picture
-from lfpiv_cli.files.particle_file import (
-    PARTICLES_FORMAT,
-    TRACKS_FORMAT,
-    TRAJECTORIES_FORMAT,
-    Points,
-    open_tracks,
-    read_points,
-)
+from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, TRACKS_FORMAT, TRAJECTORIES_FORMAT, Points
 from lfpiv_cli.files.weights_file import FORMAT, WeightsFile, open_weights
 from lfpiv_cli.flow.field import VectorField
 from lfpiv_cli.notice import written
@@ -139,7 +132,7 @@ def _lens_mm(provenance: Mapping[str, Any]) -> float | None:
 
 
 def _of_particles_in(path: Path, raw: Path | None) -> Figures:
-    points, left = read_points(path, PARTICLES_FORMAT), residual_path(path)
+    points, left = particle_file.read_points(path, PARTICLES_FORMAT), residual_path(path)
     figures = of_particles(points)
     on_images: Figures = {}
     if raw is not None:
@@ -260,8 +253,8 @@ def _light_of(content: WeightsFile) -> Figure:
 READERS: dict[str, Callable[[Path], Figures]] = {
     vtkhdf.VECTORS_FORMAT: _of_vectors_in,
     vtkhdf.VOLUME_FORMAT: lambda path: of_volume(vtkhdf.open_volume(path)),
-    TRACKS_FORMAT: lambda path: of_tracks(open_tracks(path)),
-    TRAJECTORIES_FORMAT: lambda path: of_trajectories(open_tracks(path)),
+    TRACKS_FORMAT: lambda path: of_tracks(particle_file.open_tracks(path)),
+    TRAJECTORIES_FORMAT: lambda path: of_trajectories(particle_file.open_tracks(path)),
     weights_file.FORMAT: lambda path: of_weights(open_weights(path)),
 }
 ON_IMAGES: dict[str, Callable[[Path, Path | None], Figures]] = {

@@ -31,26 +31,10 @@ from lfpiv_cli.notice import Notice, warn_of, written
 from lfpiv_cli.reconstruction.images import Image, as_if_lit, filled, light
 from lfpiv_cli.reconstruction.registry import SolverName
 from lfpiv_cli.reconstruction.solvers import reconstruct as solve
+from lfpiv_cli.verbs import frames as of_frames
 from lfpiv_cli.verbs import particles
 from lfpiv_cli.verbs.batches import Batch, BatchOptions, Expected, Worked, carried_out
-from lfpiv_cli.verbs.frames import (
-    IMAGE,
-    Bench,
-    ImageOptions,
-    Progress,
-    ReadAhead,
-    bench_of,
-    check_frame,
-    frame_notices,
-    given_picture,
-    haze_notices,
-    mask_of,
-    other_frames,
-    picture_for,
-    readable,
-    reader,
-    residual_path,
-)
+from lfpiv_cli.verbs.frames import IMAGE, Bench, ImageOptions, Progress, ReadAhead
 from lfpiv_cli.verbs.pairs import PairOptions, image_pairs, watched, work_as_they_come
 from lfpiv_cli.verbs.particles import Finder, Prepared
 from lfpiv_cli.verbs.tracers import TracerSize, light_notices, size_notices
@@ -101,13 +85,15 @@ def reconstruct(
     chosen = carried_config(weights.provenance, "the weights").overridden("reconstruction", **settings)
     if chosen.reconstruction.solver == "particles":
         raise UsageError("reconstruct: the solver particles makes no volume; find_particles finds them")
-    bench = bench_of(weights, chosen, given_picture(weights, dark), given_picture(weights, mask))
-    raw = picture_for(weights, image)
-    lit = light(raw, bench.dark, given_picture(weights, background))
-    check_frame(bench, raw, IMAGE)
-    warn_of(frame_notices(bench, raw, lit, IMAGE))
+    bench = of_frames.bench_of(
+        weights, chosen, of_frames.given_picture(weights, dark), of_frames.given_picture(weights, mask)
+    )
+    raw = of_frames.picture_for(weights, image)
+    lit = light(raw, bench.dark, of_frames.given_picture(weights, background))
+    of_frames.check_frame(bench, raw, IMAGE)
+    warn_of(of_frames.frame_notices(bench, raw, lit, IMAGE))
     volume = volume_of(bench, raw, lit, record("reconstruct", chosen.resolved(), {}))
-    warn_of(haze_notices(volume.attributes, IMAGE))
+    warn_of(of_frames.haze_notices(volume.attributes, IMAGE))
     return volume
 
 
@@ -258,11 +244,11 @@ class Reconstruction(Batch[Outcome]):
         if self._beside is not None and not self._as_particles:
             raise UsageError(f"--pairing: {solver} takes each frame alone; --solver particles does not")
         # Which other frames the background and mask of one are made from.
-        self._words = other_frames(options.level, frames, options.mask)
+        self._words = of_frames.other_frames(options.level, frames, options.mask)
         self._resolved = self._settings.resolved()
         self.targets = [Target(path, partial(self._record, number)) for number, path in enumerate(self._paths)]
         with_residuals = self._as_particles and options.residual
-        self.beside = [residual_path(path) for path in self._paths] if with_residuals else []
+        self.beside = [of_frames.residual_path(path) for path in self._paths] if with_residuals else []
         self._ready: _Ready | None = None
 
     def fault(self, number: int) -> str | None:
@@ -284,10 +270,10 @@ class Reconstruction(Batch[Outcome]):
         options, settings, frames = self._options, self._settings, self._frames
         if self._as_particles and options.residual:
             for number in numbers:
-                ensure_writable(residual_path(self._paths[number]), self._replace)
+                ensure_writable(of_frames.residual_path(self._paths[number]), self._replace)
             coming = set(numbers)
             complete = [path for number, path in enumerate(self._paths) if number not in coming and path.exists()]
-            if without := sum(not residual_path(path).exists() for path in complete):
+            if without := sum(not of_frames.residual_path(path).exists() for path in complete):
                 console.say(f"{without} frames that are complete have no residual image; --overwrite makes both anew")
         if not numbers:
             return 0.0
@@ -307,13 +293,13 @@ class Reconstruction(Batch[Outcome]):
         shape = content.image_shape
         dark = options.dark_image(shape)
         pitch_px = float(content.camera.micro_image_lattice_px().pitch.max())
-        mask = mask_of(options.mask, frames, shape, pitch_px, options.keep_going)
+        mask = of_frames.mask_of(options.mask, frames, shape, pitch_px, options.keep_going)
         bench = prepared.bench(content, settings, dark, mask)
-        read = reader(options.level, frames, shape, dark, options.keep_going)
+        read = of_frames.reader(options.level, frames, shape, dark, options.keep_going)
         size, said = None, []
         if self._as_particles:
             # What cannot be read is told where its turn comes.
-            pictures = readable(read, self._every, keep_going=True)
+            pictures = of_frames.readable(read, self._every, keep_going=True)
             seen = (particles.frame_of(bench, *each) for each in pictures)
             bench, size = particles.sized(bench, seen, prepared.size)
             said = size_notices(settings, size)
@@ -331,15 +317,15 @@ class Reconstruction(Batch[Outcome]):
             raise RuntimeError("a batch begins before anything of it is made")
         ready, bench, name, target = self._ready, self._ready.bench, self.names[number], self.targets[number]
         pictures = ready.ahead(number)
-        check_frame(bench, pictures[0], str(self._frames[number].path))
+        of_frames.check_frame(bench, pictures[0], str(self._frames[number].path))
         made = target.record
-        notices = file_notices(made, name) + frame_notices(bench, *pictures, name)
+        notices = file_notices(made, name) + of_frames.frame_notices(bench, *pictures, name)
         work.console.warn(notices)
         if ready.size is None:
             made = with_warnings(made, notices)
             volume = volume_of(bench, *pictures, made, work.advance)
             array, grid, reference, reported = volume.array, volume.grid, volume.reference, volume.attributes
-            of_haze = haze_notices(reported, name)
+            of_haze = of_frames.haze_notices(reported, name)
             work.console.warn(of_haze)
             made = with_warnings(made, of_haze)
             vtkhdf.write_volume(
@@ -356,7 +342,7 @@ class Reconstruction(Batch[Outcome]):
         if self._options.residual:
             left = particles.what_is_left(frame, found)
             # Made again whenever the particles are: an interrupted batch may have left one without them.
-            image_files.write_tiff(residual_path(target.path), left.astype(np.float32), overwrite=True)
+            image_files.write_tiff(of_frames.residual_path(target.path), left.astype(np.float32), overwrite=True)
         points = replace(points, provenance=with_warnings(made, of_light))
         write_points(target.path, PARTICLES_FORMAT, points, overwrite=self._replace)
         reported = points.attributes

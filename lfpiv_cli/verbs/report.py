@@ -19,31 +19,15 @@ import yaml
 from lfpiv_cli.arrays import Floats
 from lfpiv_cli.console import CONSOLE, Console, readable
 from lfpiv_cli.errors import ConfigError, InputError, UsageError
-from lfpiv_cli.files import calibration_file, weights_file
+from lfpiv_cli.files import calibration_file, pages, particle_file, weights_file
 from lfpiv_cli.files.atomic import ensure_writable
 from lfpiv_cli.files.calibration_file import open_calibration
 from lfpiv_cli.files.config import carried_config
 from lfpiv_cli.files.hdf5 import open_h5, read_provenance
 from lfpiv_cli.files.images import count_pages
 from lfpiv_cli.files.listing import natural
-from lfpiv_cli.files.pages import (
-    Page,
-    Picture,
-    Section,
-    Table,
-    ensure_drawing,
-    ensure_pages,
-    write_pages,
-    write_picture,
-)
-from lfpiv_cli.files.particle_file import (
-    PARTICLES_FORMAT,
-    TRACKS_FORMAT,
-    TRAJECTORIES_FORMAT,
-    Points,
-    open_tracks,
-    read_points,
-)
+from lfpiv_cli.files.pages import Page, Picture, Section, Table, write_pages, write_picture
+from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, TRACKS_FORMAT, TRAJECTORIES_FORMAT, Points
 from lfpiv_cli.files.provenance import sha256
 from lfpiv_cli.files.vtkhdf import VECTORS_FORMAT, VOLUME_FORMAT, open_vectors, read_extra, read_header
 from lfpiv_cli.flow.field import MASKED, MM_TO_M, REJECTED, VALID, VectorField
@@ -146,8 +130,8 @@ def report(
     ensure_writable(output, overwrite, options.raw)
     for path in options.raw:
         count_pages(path)  # for its checks
-    ensure_pages()
-    ensure_drawing()
+    pages.ensure_pages()
+    pages.ensure_drawing()
     contents = contents_of(folder.parent, [folder]) if os.path.isfile(folder) else contents_of(folder)
     fields = {path: open_vectors(path) for path in contents.of("vectors")[:MOST_FIELDS]}
     parts = judged(contents, fields)
@@ -191,7 +175,7 @@ def _sentence(contents: Contents, fields: Fields, faults: int) -> str:
         against = f"{faults} faults speak against it" if faults > 1 else "one fault speaks against it"
     first, tracks = next(iter(_by_command(contents, fields).values()), []), contents.of("tracks")
     if tracks and (not first or (len(first) == 1 and checks.verb_of(contents.record(first[0])) != "correlate")):
-        points = open_tracks(tracks[0])
+        points = particle_file.open_tracks(tracks[0])
         track = points.arrays.get("track")
         number = f"{len(points.position_mm) if track is None else len(np.unique(track)):,} tracks"
         size, velocity, sigma = points.position_mm, points.arrays["velocity"], points.arrays["velocity_sigma"]
@@ -401,7 +385,10 @@ def _chain(contents: Contents, fields: Fields, drawer: Drawer) -> Iterable[Secti
         yield Section("Statistics", "statistics", tables=tuple(_statistics(path)), pictures=tuple(pictures))
     tracks = contents.of("tracks")
     for path in tracks[:1]:
-        points, which = open_tracks(path), f"the first of {len(tracks)} files, " if len(tracks) > 1 else ""
+        points, which = (
+            particle_file.open_tracks(path),
+            f"the first of {len(tracks)} files, " if len(tracks) > 1 else "",
+        )
         words = f"The view can be turned; it shows at most {MOST_LINES:,} tracks of {which}{path.name}, {FAINT_WORDS}."
         view = views.of(_of_points(points), contents.record(path), words)
         pictures = drawer.pictures(path, only=OF_TRACKS)
@@ -493,7 +480,7 @@ def _volume_row(path: Path) -> Row:
 
 
 def _particle_row(path: Path) -> Row:
-    points = read_points(path, PARTICLES_FORMAT)
+    points = particle_file.read_points(path, PARTICLES_FORMAT)
     inside = points.arrays["flag"] == 0
     sigma = np.sqrt(points.arrays["covariance_mm2"][inside, :3])
     reported = points.attributes

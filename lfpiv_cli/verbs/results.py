@@ -12,15 +12,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lfpiv_cli.errors import UsageError
+from lfpiv_cli.files import particle_file
 from lfpiv_cli.files.export_formats import Content, columns_of, content_of
-from lfpiv_cli.files.particle_file import (
-    PARTICLES_FORMAT,
-    POSITION,
-    TRACKS_FORMAT,
-    TRAJECTORIES_FORMAT,
-    Points,
-    write_points,
-)
+from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, POSITION, TRACKS_FORMAT, TRAJECTORIES_FORMAT, Points
 from lfpiv_cli.files.vtkhdf import VECTORS_FORMAT, VOLUME_FORMAT, Volume, write_vectors, write_volume
 from lfpiv_cli.flow.field import VectorField
 from lfpiv_cli.grid import Grid, Reference
@@ -194,7 +188,7 @@ def _write_weights(content: WeightsFile, path: Path, overwrite: bool) -> None:
 
 def _write_points(result: Points | Tracked, path: Path, overwrite: bool) -> None:
     points = _points_of(result)
-    write_points(path, points.format_name, points, overwrite=overwrite)
+    particle_file.write_points(path, points.format_name, points, overwrite=overwrite)
 
 
 def _of_arrays(

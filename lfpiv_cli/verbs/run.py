@@ -34,7 +34,7 @@ from lfpiv_cli.files.pairing import Pairs
 from lfpiv_cli.files.provenance import Gone, carried_record, sha256, without_warnings
 from lfpiv_cli.names import FlowMethod
 from lfpiv_cli.notice import written
-from lfpiv_cli.verbs import build_weights, calibrate, particles
+from lfpiv_cli.verbs import build_weights, calibrate, particles, run_steps
 from lfpiv_cli.verbs.batches import ALL, MB, Expected, Failure, Worked, dry_run, estimate
 from lfpiv_cli.verbs.build_weights import plan_of
 from lfpiv_cli.verbs.calibrate import ensure_pictures
@@ -45,19 +45,7 @@ from lfpiv_cli.verbs.following import SHORTEST, ensure_sequence
 from lfpiv_cli.verbs.frames import Bench, Read, mask_of, other_frames, read_frame, reader
 from lfpiv_cli.verbs.pairs import image_pairs
 from lfpiv_cli.verbs.report import ReportOptions, report
-from lfpiv_cli.verbs.run_steps import (
-    CALIBRATION,
-    KEPT,
-    MADE,
-    RECORD,
-    RESULTS,
-    WEIGHTS,
-    Chain,
-    RunOptions,
-    Steps,
-    Vectors,
-    earlier_run,
-)
+from lfpiv_cli.verbs.run_steps import Chain, RunOptions, Steps, Vectors
 from lfpiv_cli.verbs.simulate import frame_names, simulate_board, simulate_particles, simulate_white
 from lfpiv_cli.verbs.weights_cost import FLOAT_BYTES, Cost, cost_of, ensure_volume_fits
 
@@ -98,7 +86,7 @@ def run(
         return watch(config, settings, output, options, overwrite, console)
     frames, pairs = _ensure_possible(settings, options)
     console.warn(pairs.settled(options.keep_going))
-    steps = Steps(output, console, earlier_run(output, overwrite), options.deadline(), options.shard == ALL)
+    steps = Steps(output, console, run_steps.earlier_run(output, overwrite), options.deadline(), options.shard == ALL)
     chain = Chain(config, settings, options, frames, pairs, steps, overwrite)
     if not options.dry_run:
         ensure_volume_fits(settings, options.method in ("volumes", "both"))
@@ -112,7 +100,7 @@ def run(
 def take_all(chain: Chain) -> dict[str, Any]:
     """Take all steps; return what is told of them (PartialError: something failed)."""
     steps, options, output = chain.steps, chain.options, chain.steps.output
-    ensure_writable(output / RECORD, overwrite=True)
+    ensure_writable(output / run_steps.RECORD, overwrite=True)
     weights = chain.weights()
     if not chain.share:
         return steps.summary()
@@ -130,7 +118,7 @@ def take_all(chain: Chain) -> dict[str, Any]:
             *options.board,
         )
         page = output / REPORT
-        is_kept = page.exists() and not steps.count(MADE)
+        is_kept = page.exists() and not steps.count(run_steps.MADE)
 
         def make() -> dict[str, Any]:
             # Of all that the folder holds, where a step has made anything.
@@ -158,9 +146,9 @@ def take_all(chain: Chain) -> dict[str, Any]:
 def in_words(chain: Chain, reported: Mapping[str, Any], vectors: Vectors, failures: Sequence[Failure]) -> list[str]:
     """Return what a person wants to know of a run: what was found, what was made, and what to open next."""
     steps, output = chain.steps, chain.steps.output
-    found: dict[str, list[str]] = {MADE: [], KEPT: []}
+    found: dict[str, list[str]] = {run_steps.MADE: [], run_steps.KEPT: []}
     for step in steps.reported["steps"].values():
-        names = found[MADE if step["state"] == MADE else KEPT]
+        names = found[run_steps.MADE if step["state"] == run_steps.MADE else run_steps.KEPT]
         names += [name for name in dict.fromkeys(file.split("/")[0] for file in step["files"]) if name not in names]
     files = [f"{state}: {', '.join(names)}" for state, names in found.items() if names]
     flow = next(iter(vectors.values()), output / TRACKS if chain.options.follow else None)
@@ -172,7 +160,7 @@ def in_words(chain: Chain, reported: Mapping[str, Any], vectors: Vectors, failur
         *(f"failed: {failure.name}: {failure.error}" for failure in failures),
         *files,
         f"open next: {', '.join(shown)}" if shown else f"all is in {output}",
-        f"all figures: --json, -v, or {output / RECORD}",
+        f"all figures: --json, -v, or {output / run_steps.RECORD}",
     ]
 
 
@@ -335,8 +323,8 @@ def planned(chain: Chain) -> dict[str, Any]:
     """
     settings, output, options, console = chain.settings, chain.steps.output, chain.options, chain.steps.console
     targets = {
-        "calibrate-snapshot": calibrate.target_of(chain.config, output / CALIBRATION, chain.photographs),
-        "build-weights": build_weights.target_of(chain.config, output / WEIGHTS, chain.made_with),
+        "calibrate-snapshot": calibrate.target_of(chain.config, output / run_steps.CALIBRATION, chain.photographs),
+        "build-weights": build_weights.target_of(chain.config, output / run_steps.WEIGHTS, chain.made_with),
     }
     before: list[str] = []
     for name, target in targets.items():
@@ -346,7 +334,7 @@ def planned(chain: Chain) -> dict[str, Any]:
     counts = {"frames": len(chain.order), "pairs": len(chain.share), "steps_to_make": before}
     if before:
         return counts | _from_nothing(chain)
-    weights, to_come = output / WEIGHTS, _weights_to_come(chain)
+    weights, to_come = output / run_steps.WEIGHTS, _weights_to_come(chain)
     methods = chosen(settings, options, lambda: counted(chain, weights)).methods
     reported: dict[str, dict[str, Any]] = {}
     for method in methods:
@@ -362,7 +350,7 @@ def planned(chain: Chain) -> dict[str, Any]:
         if not in_time:
             size = field_bytes(settings, settings.grid()) if method == "volumes" else None
             batch = chain.in_pairs(method, found, size)
-            reported[RESULTS[method]] = dry_run(batch, chain.batch_options(shared=True), console)
+            reported[run_steps.RESULTS[method]] = dry_run(batch, chain.batch_options(shared=True), console)
     return counts | {"method": " and ".join(methods)} | _together(reported)
 
 
@@ -372,7 +360,7 @@ def with_overwrite(chain: Chain) -> str:
         reported = planned(chain)
     except LfpivError:
         return ""
-    before = {"calibrate-snapshot": CALIBRATION, "build-weights": WEIGHTS}
+    before = {"calibrate-snapshot": run_steps.CALIBRATION, "build-weights": run_steps.WEIGHTS}
     again = [before[step] for step in reported["steps_to_make"]]
     kept = [name for name in before.values() if name not in again]
     if again:
@@ -396,7 +384,7 @@ def with_overwrite(chain: Chain) -> str:
 
 def _weights_to_come(chain: Chain) -> Gone | None:
     """Return the weights with the record that they will carry; None where it is the one that they have."""
-    weights = chain.steps.output / WEIGHTS
+    weights = chain.steps.output / run_steps.WEIGHTS
     made = build_weights.target_of(chain.config, weights, chain.made_with).record
     return None if without_warnings(carried_record(weights)) == made else Gone(sha256(weights), made)
 
@@ -411,7 +399,7 @@ def _from_nothing(chain: Chain) -> dict[str, Any]:
     methods: list[FlowMethod] = ["volumes", "particles"] if asked == "both" else ["volumes"]
     if asked == "particles":
         methods = ["particles"]
-    calibration = chain.steps.output / CALIBRATION
+    calibration = chain.steps.output / run_steps.CALIBRATION
     cost: Cost | None = None
     # What the weights will cost is not always known without a calibration.
     with contextlib.suppress(LfpivError):
@@ -425,7 +413,7 @@ def _from_nothing(chain: Chain) -> dict[str, Any]:
     reported = {}
     counts = ((len(chain.order), len(good)), (len(chain.share), len(whole)))
     for method in methods:
-        names = ((method, "reconstruct"), (RESULTS[method], "correlate" if method == "volumes" else "track"))
+        names = ((method, "reconstruct"), (run_steps.RESULTS[method], "correlate" if method == "volumes" else "track"))
         for (folder, label), (given, count), size in zip(names, counts, sizes[method], strict=True):
             dropped = options.keep == "results" and chain.pairs.separate | (method == "volumes")
             if dropped and folder == method:

@@ -64,11 +64,7 @@ class Diffusion:
 
     def summary(self) -> dict[str, float | None]:
         """Return what is told of it; None where it is not known."""
-        return {
-            "diffusion_px": self.px,
-            "diffusion_measured_px": self.measured_px,
-            "diffusion_sigma_px": self.sigma_px,
-        }
+        return {"diffusion_px": self.px, "diffusion_measured_px": self.measured_px, "diffusion_sigma_px": self.sigma_px}
 
 
 @dataclass(frozen=True)

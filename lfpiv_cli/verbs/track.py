@@ -26,21 +26,12 @@ from lfpiv_cli.names import GridMethod
 from lfpiv_cli.tracks.candidates import Seen, Trajectories
 from lfpiv_cli.tracks.sequences import HALVES_FRAMES
 from lfpiv_cli.verbs import checks
+from lfpiv_cli.verbs import tracks as of_tracks
 from lfpiv_cli.verbs.batches import Worked, carried_out
 from lfpiv_cli.verbs.fields import fields_of
 from lfpiv_cli.verbs.frames import dt_notices
 from lfpiv_cli.verbs.pairs import PairBatch, PairBatchOptions, doubts
-from lfpiv_cli.verbs.tracks import (
-    Tracking,
-    TracksOf,
-    ensure_frames,
-    ensure_particles,
-    seen_in,
-    settings_of,
-    tracked,
-    tracking_of,
-    tracks_through,
-)
+from lfpiv_cli.verbs.tracks import Tracking, TracksOf
 
 # States look at so many frames, one after the other; forecasts at fewer.
 KEPT_FRAMES = 2 * max(HALVES_FRAMES) + 1
@@ -65,7 +56,7 @@ class SeenFrames(Sequence[Seen]):
         return self._seen(number)
 
     def _seen_in(self, number: int) -> Seen:
-        found = seen_in(self._read(number))
+        found = of_tracks.seen_in(self._read(number))
         self._counts[number] = len(found)
         return found
 
@@ -90,7 +81,7 @@ def stored_tracks(
     ------
     OutputError : there is no room in the folder
     """
-    sequence = tracks_through(frames, chosen, found)
+    sequence = of_tracks.tracks_through(frames, chosen, found)
     with particle_file.StoredTracks(folder, reference, chosen.attributes(reference), dict(provenance)) as points:
         for number in range(len(frames)):
             points.put(sequence.at(number))
@@ -156,7 +147,7 @@ class Tracks(PairBatch[Outcome, TrackOptions]):
             frames = results_seen(files)
             order, self.notices = ([0, 1], doubts(frames)) if len(frames) == 2 else in_order(frames)
             groups, paths = [tuple(files[number] for number in order)], [output]
-        ensure_frames(len(groups[0]), options.shortest)
+        of_tracks.ensure_frames(len(groups[0]), options.shortest)
         self._groups = groups
         grids = [grid_paths(path, len(groups[0]) - 1) if options.grid else [] for path in paths]
         self.targets = [
@@ -175,9 +166,11 @@ class Tracks(PairBatch[Outcome, TrackOptions]):
         # A pair is read once; of a sequence all that is kept of a frame is its record.
         read = lru_cache(maxsize=2)(partial(particle_file.read_points, format_name=particle_file.PARTICLES_FORMAT))
         counts, records = zip(*((frame.count, frame.provenance) for frame in map(read, paths)), strict=True)
-        ensure_particles(counts, names)
-        settings = settings_of(records, names, self._options.dt_s)
-        chosen = tracking_of(settings, self._options.search_voxel, self._options.shortest, len(paths), names[0])
+        of_tracks.ensure_particles(counts, names)
+        settings = of_tracks.settings_of(records, names, self._options.dt_s)
+        chosen = of_tracks.tracking_of(
+            settings, self._options.search_voxel, self._options.shortest, len(paths), names[0]
+        )
         with _tracks(paths, read, settings, chosen, dict(target.record), target.path.parent) as found:
             roles = zip(_roles(paths).items(), records, strict=True)
             reported = {f"{role} {path.name}": made for (role, path), made in roles}
@@ -220,8 +213,8 @@ class Tracks(PairBatch[Outcome, TrackOptions]):
         options, paths = self._options, self._groups[number]
         names = [str(path) for path in paths]
         records = [self._gone[path].record if path in self._gone else carried_record(path) for path in paths]
-        settings = settings_of(records, names, options.dt_s)
-        chosen = tracking_of(settings, options.search_voxel, options.shortest, len(paths), names[0])
+        settings = of_tracks.settings_of(records, names, options.dt_s)
+        chosen = of_tracks.tracking_of(settings, options.search_voxel, options.shortest, len(paths), names[0])
         reported = chosen.reported() | ({"grid_by": options.by} if options.grid and options.by != "polynomials" else {})
         return record("track", settings.resolved() | reported, _roles(paths), gone=self._gone)
 
@@ -271,7 +264,7 @@ def _tracks(
 ) -> Iterator[TracksOf[Any]]:
     """Yield the tracks of a pair of files in memory, those of a sequence on a disk; `made` is their provenance."""
     if chosen.shortest is None:
-        yield tracked([read(path) for path in paths], settings, chosen, made)
+        yield of_tracks.tracked([read(path) for path in paths], settings, chosen, made)
         return
     frames, reference = SeenFrames(len(paths), lambda number: read(paths[number])), read(paths[0]).reference
     with stored_tracks(frames, reference, settings, chosen, made, folder) as found:

@@ -239,12 +239,7 @@ class Latest:
         self._tell(name, cells, line, figures | {"tracers_per_lens": tracers_per_lens, "seconds": seconds}, flow)
 
     def _tell(
-        self,
-        name: str,
-        cells: tuple[str, ...],
-        line: str,
-        figures: Mapping[str, Any],
-        flow: VectorField | None = None,
+        self, name: str, cells: tuple[str, ...], line: str, figures: Mapping[str, Any], flow: VectorField | None = None
     ) -> None:
         """Print a pair's line, add it to the log, and renew the page, with its picture where there is one."""
         self.console.answer(f"{name}  {line}")
