@@ -21,7 +21,7 @@ from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, open_tracks, read_po
 from lfpiv_cli.files.provenance import carried_record, even_step_s, seconds_between, sha256
 from lfpiv_cli.files.vtkhdf import open_vectors, open_volume
 from lfpiv_cli.verbs import run as run_stage
-from lfpiv_cli.verbs.frames import frames_dt_notices
+from lfpiv_cli.verbs.frames import dt_notices
 from lfpiv_cli.verbs.run_steps import RunOptions
 from tests import camera_files
 from tests.camera_files import STEP_US, write_cine
@@ -207,6 +207,10 @@ def made(time_s: float | None, digest: str = "x") -> dict[str, Any]:
 def test_frames_of_a_recording_tell_their_time(tmp_path: Path) -> None:
     write_cine(tmp_path / "run.cine", np.arange(24, dtype=np.uint16).reshape(4, 2, 3))
     frames, dt_s = frames_of([tmp_path / "run.cine"]), STEP_US * 1e-6
+
+    def frames_dt_notices(stated_s, frames):
+        return dt_notices(stated_s, [one.seconds_to(other) for one, other in pairwise(frames)], "run.cine")
+
     for stated, codes in ((dt_s, []), (1.005 * dt_s, []), (1.02 * dt_s, ["time-between-frames"]), (None, [])):
         assert [notice.code for notice in frames_dt_notices(stated, frames)] == codes
     # One that was dropped is found among the others.

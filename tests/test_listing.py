@@ -15,11 +15,11 @@ import pytest
 from lfpiv_cli.errors import InputError, UsageError
 from lfpiv_cli.files import listing
 from lfpiv_cli.files.atomic import write_json
-from lfpiv_cli.files.batch import Frame
+from lfpiv_cli.files.batch import Frame, images_seen, results_seen
 from lfpiv_cli.files.hdf5 import write_header
 from lfpiv_cli.files.listing import expanded, files_in
 from lfpiv_cli.verbs import particles
-from lfpiv_cli.verbs.pairs import PairOptions, image_pairs, result_pairs
+from lfpiv_cli.verbs.pairs import PairOptions, found_pairs
 from tests.commands import run
 
 
@@ -95,34 +95,34 @@ def test_pages_are_pairs_within_their_file_and_results_by_these(tmp_path: Path) 
     frames = [
         Frame(Path(name), page, pages) for name, pages in (("x/r1.tif", 4), ("r2.tif", 3)) for page in range(pages)
     ]
-    found = image_pairs(frames, AB)
+    found = found_pairs(images_seen(frames), AB)
     assert found.pairs == ((0, 1), (2, 3), (4, 5))
     assert [each.about for each in found.left_out] == ["r2.tif, page 2"]
     # Page 1 is a second frame, whatever is left of the others.
-    assert image_pairs(frames[1:3], AB).pairs == ()
-    assert image_pairs(frames[:3], PairOptions(pairing="sequence")).pairs == ((0, 1), (1, 2))
+    assert found_pairs(images_seen(frames[1:3]), AB).pairs == ()
+    assert found_pairs(images_seen(frames[:3]), PairOptions(pairing="sequence")).pairs == ((0, 1), (1, 2))
     # Results of pages are pairs by these.
     left = [result(tmp_path, f"run_{page:04d}", "run.tif", page) for page in (0, 1, 2, 4, 5)]
-    found = result_pairs(left, AB)
+    found = found_pairs(results_seen(left), AB)
     assert found.pairs == ((0, 1), (3, 4))
     assert [each.about for each in found.left_out] == [str(left[2])]
     # Each the first page of its file, as the second could not be read.
     first = [result(tmp_path, f"run{k}_0000", f"run{k}.tif") for k in (1, 2)]
-    assert result_pairs(first, AB).pairs == ()
+    assert found_pairs(results_seen(first), AB).pairs == ()
     # Each a second one, whatever it is called.
     second = [result(tmp_path, name, f"run{k}.tif", 1) for k, name in enumerate(("early", "late"), start=1)]
-    assert result_pairs(second, AB).pairs == ()
+    assert found_pairs(results_seen(second), AB).pairs == ()
 
 
 def test_images_pair_results_whatever_their_names_but_once(tmp_path: Path) -> None:
     names = {"b": "img_1_a.tif", "a": "img_1_b.tif"}
     paths = [result(tmp_path, name, image) for name, image in names.items()]
-    assert result_pairs(paths, AB).pairs == ((0, 1),)
-    assert result_pairs(paths[::-1], AB).pairs == ((1, 0),)
+    assert found_pairs(results_seen(paths), AB).pairs == ((0, 1),)
+    assert found_pairs(results_seen(paths[::-1]), AB).pairs == ((1, 0),)
     # The same image twice is left out.
     paths = [result(tmp_path, f"{k}a", f"{k}a.tif", digest="same") for k in (1, 2)]
     paths += [result(tmp_path, f"{k}b", f"{k}b.tif") for k in (1, 2)]
-    found = result_pairs(paths, AB)
+    found = found_pairs(results_seen(paths), AB)
     assert found.pairs == ((0, 2),)
     assert [each.about for each in found.left_out] == [str(paths[1]), str(paths[3])]
     assert "same image" in found.left_out[0].text
@@ -131,7 +131,7 @@ def test_images_pair_results_whatever_their_names_but_once(tmp_path: Path) -> No
     broken = tmp_path / "2a.vtkhdf"
     broken.write_bytes(b"")
     write_json(tmp_path / "2b.vtkhdf", {}, overwrite=True)
-    assert result_pairs([*paths, broken, tmp_path / "2b.vtkhdf"], AB).pairs == ((1, 0), (2, 3))
+    assert found_pairs(results_seen([*paths, broken, tmp_path / "2b.vtkhdf"]), AB).pairs == ((1, 0), (2, 3))
 
 
 def test_two_without_options_are_taken_as_given(tmp_path: Path) -> None:
@@ -139,18 +139,18 @@ def test_two_without_options_are_taken_as_given(tmp_path: Path) -> None:
     for path in given:
         (tmp_path / path).write_bytes(b"")
     paths = [tmp_path / path for path in given]
-    assert result_pairs(paths, PairOptions()).notices == ()
-    backwards = result_pairs(paths[::-1], PairOptions())
+    assert found_pairs(results_seen(paths), PairOptions()).notices == ()
+    backwards = found_pairs(results_seen(paths[::-1]), PairOptions())
     assert backwards.pairs == ((0, 1),)
     assert [notice.code for notice in backwards.notices] == ["pair-backwards"]
     apart = [tmp_path / "1a.vtkhdf", tmp_path / "2b.vtkhdf"]
     (tmp_path / "2b.vtkhdf").write_bytes(b"")
-    (notice,) = result_pairs(apart, PairOptions()).notices
+    (notice,) = found_pairs(results_seen(apart), PairOptions()).notices
     assert notice.code == "pair-contradicted"
     assert all(str(path) in str(notice) for path in apart)
     for count in (1, 3):
         with pytest.raises(UsageError, match=r"pairs"):
-            result_pairs([paths[0]] * count, PairOptions())
+            found_pairs(results_seen([paths[0]] * count), PairOptions())
 
 
 @pytest.fixture
@@ -160,7 +160,7 @@ def listed(tmp_path: Path):
 
     def of(text: str):
         (tmp_path / "pairs.csv").write_text(text)
-        return image_pairs(frames, PairOptions(pairs=tmp_path / "pairs.csv"))
+        return found_pairs(images_seen(frames), PairOptions(pairs=tmp_path / "pairs.csv"))
 
     return of
 
@@ -174,9 +174,9 @@ def test_a_list_pairs_frames_by_any_name_that_is_one_frame_s(listed, tmp_path: P
     (tmp_path / "pairs.txt").write_text("3.tif x/3.tif\n")
     frames = [Frame(Path(f"{folder}/3.tif"), 0, 1) for folder in "xy"]
     with pytest.raises(InputError, match="name of 2 frames"):
-        image_pairs(frames, PairOptions(pairs=tmp_path / "pairs.txt"))
+        found_pairs(images_seen(frames), PairOptions(pairs=tmp_path / "pairs.txt"))
     with pytest.raises(UsageError, match="--pairs"):
-        image_pairs(frames, PairOptions(pairs=tmp_path / "pairs.txt", pair_by="{number}"))
+        found_pairs(images_seen(frames), PairOptions(pairs=tmp_path / "pairs.txt", pair_by="{number}"))
 
 
 @pytest.mark.parametrize(

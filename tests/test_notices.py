@@ -85,7 +85,7 @@ def codes(picture: NDArray[np.uint16], folder: Path) -> list[str]:
 def test_documents_list_all_codes() -> None:
     made = set()
     for path in (ROOT / "lfpiv_cli").rglob("*.py"):
-        made |= set(re.findall(r'(?:\bNotice\(\s*|code=)"([^"]*)"', path.read_text(encoding="utf-8")))
+        made |= set(re.findall(r'(?:\b(?:Notice|against)\(\s*|code=)"([^"]*)"', path.read_text(encoding="utf-8")))
     page = (ROOT / "docs" / "troubleshooting.md").read_text(encoding="utf-8")
     listed = re.findall(r"^\| `([a-z-]+)` \|", page.split("## Warnings")[1].split("\n## ")[0], re.MULTILINE)
     assert sorted(listed) == sorted(made)

@@ -320,8 +320,7 @@ class Correlation(PairBatch[Outcome, CorrelateOptions]):
         camera, media = config.camera_model(), config.media_model()
         field = with_locking(field, first.reference, camera.scale(media))
         quality, name = checks.quality_of(field), target.path.name
-        records = ([self._record_of(path) for path in pair] for pair in pairs)
-        notices += dt_notices(config.correlation.dt_s, records, name)
+        notices += dt_notices(config.correlation.dt_s, self._steps_s(number), name)
         notices += [*checks.field_notices(quality, name), *checks.pair_notices(field, quality, name)]
         work.console.warn(notices)
         derived = derived_fields(field) if self._options.derived else None
@@ -364,12 +363,13 @@ class Correlation(PairBatch[Outcome, CorrelateOptions]):
         settings = self._settings_of(group[0][0])
         if settings.correlation.dt_s is None:
             # Where the recordings of the frames of all pairs tell it: the same in all of them.
-            steps = [
-                provenance.seconds_between(self._record_of(first), self._record_of(second)) for first, second in group
-            ]
-            step_s = provenance.even_step_s(steps, [str(group[0][0]), str(group[-1][1])])
+            step_s = provenance.even_step_s(self._steps_s(number), [str(group[0][0]), str(group[-1][1])])
             settings = settings.overridden("correlation", dt_s=step_s)
         return settings
+
+    def _steps_s(self, number: int) -> list[float | None]:
+        """Return the recorded times between the frames of a field's pairs."""
+        return [provenance.seconds_between(*map(self._record_of, pair)) for pair in self._groups[number]]
 
     def _record_of(self, volume: Path) -> Mapping[str, Any]:
         """Return the record of a volume, which may be gone."""

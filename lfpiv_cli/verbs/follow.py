@@ -158,11 +158,11 @@ def follow_particles(
     content = open_weights_that_fit(weights)
     settings = carried_config(content.provenance, weights).overridden("reconstruction", solver="particles")
     settings = settings.overridden("correlation", dt_s=options.dt_s)
+    steps = [before.seconds_to(after) for before, after in pairwise(frames)]
     if settings.correlation.dt_s is None:
-        steps = [before.seconds_to(after) for before, after in pairwise(frames)]
         names = [f"{each.path} page {each.page}" for each in frames]
         settings = settings.overridden("correlation", dt_s=even_step_s(steps, names))
-    console.warn(of_frames.frames_dt_notices(settings.correlation.dt_s, frames))
+    console.warn(of_frames.dt_notices(settings.correlation.dt_s, steps, str(frames[0].path)))
     tracking = tracking_of(settings, options.search_voxel, options.shortest, len(frames), str(weights))
     left_out: list[Failure] = []
     if options.keep_going:

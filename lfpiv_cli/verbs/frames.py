@@ -28,7 +28,7 @@ from lfpiv_cli.files import images as image_files
 from lfpiv_cli.files.batch import Frame
 from lfpiv_cli.files.config import Config
 from lfpiv_cli.files.inputs import given
-from lfpiv_cli.files.provenance import seconds_between, sha256
+from lfpiv_cli.files.provenance import sha256
 from lfpiv_cli.files.weights_file import WeightsFile
 from lfpiv_cli.notice import Notice, written
 from lfpiv_cli.reconstruction import images as of_images
@@ -415,19 +415,8 @@ def residual_path(particles: Path) -> Path:
     return particles.with_name(f"{particles.stem}_residual.tif")
 
 
-def dt_notices(stated_s: float | None, pairs: Iterable[Sequence[Mapping[str, Any]]], name: str) -> list[Notice]:
-    """Return where a stated time between frames contradicts the recorded one, by the records of pairs of results."""
-    return _interval_notices(stated_s, [seconds_between(first, second) for first, second in pairs], name)
-
-
-def frames_dt_notices(stated_s: float | None, frames: Sequence[Frame]) -> list[Notice]:
-    """Return where a stated time between frames contradicts the recorded one of frames in a row."""
-    times = [frame.time_s if frame.path == frames[0].path else None for frame in frames]
-    steps = [None if a is None or b is None else b - a for a, b in pairwise(times)]
-    return _interval_notices(stated_s, steps, str(frames[0].path))
-
-
-def _interval_notices(stated_s: float | None, recorded_s: Sequence[float | None], name: str) -> list[Notice]:
+def dt_notices(stated_s: float | None, recorded_s: Iterable[float | None], name: str) -> list[Notice]:
+    """Return where a stated time between frames contradicts the recorded ones, as far as these are known."""
     known = [step for step in recorded_s if step is not None]
     if stated_s is None or not known:
         return []

@@ -16,7 +16,7 @@ from lfpiv_cli.console import Console, Frames
 from lfpiv_cli.errors import InputError, UsageError
 from lfpiv_cli.files import images as image_files
 from lfpiv_cli.files import vtkhdf
-from lfpiv_cli.files.batch import Frame, State, Target, images_seen, pending, results_seen, state_or_none
+from lfpiv_cli.files.batch import State, Target, pending, results_seen, state_or_none
 from lfpiv_cli.files.listing import as_they_come, files_in
 from lfpiv_cli.files.pairing import Pairs, Seen, contradiction, in_order, pair_frames, pairs_listed
 from lfpiv_cli.files.provenance import Gone, carried_record, sha256, without_warnings
@@ -90,7 +90,7 @@ class PairBatch(Batch[Made], ABC, Generic[Made, Chosen]):
 
     def _paired(self, files: Sequence[Path], pairs: Pairs | None) -> list[tuple[Path, Path]]:
         """Return the files of each pair; note what is to be said of them, and those without a partner."""
-        found = result_pairs(files, self._options) if pairs is None else pairs
+        found = found_pairs(results_seen(files), self._options) if pairs is None else pairs
         self.notices, self.left_out = found.settled(self._options.keep_going), failures_of(found)
         return [(files[first], files[second]) for first, second in found.pairs]
 
@@ -98,16 +98,6 @@ class PairBatch(Batch[Made], ABC, Generic[Made, Chosen]):
 def failures_of(pairs: Pairs) -> list[Failure]:
     """Return the frames that have no partner, as what has failed."""
     return [Failure(each.about, each.text) for each in pairs.left_out]
-
-
-def image_pairs(frames: Sequence[Frame], options: PairOptions) -> Pairs:
-    """Return which frames of images belong together, see `found_pairs`."""
-    return found_pairs(images_seen(frames), options)
-
-
-def result_pairs(paths: Sequence[Path], options: PairOptions) -> Pairs:
-    """Return which volumes or files of particles belong together, see `found_pairs`."""
-    return found_pairs(results_seen(paths), options)
 
 
 def found_pairs(frames: Sequence[Seen], options: PairOptions, coming: bool = False) -> Pairs:

@@ -267,7 +267,10 @@ def _lens_mm(bench: Bench) -> float:
 def task_for(bench: Bench, frame: Frame) -> Task:
     """Return the task that a frame sets."""
     content, photons = bench.content, bench.settings.reconstruction.photons_per_count
-    view = _view(bench, _light(content, bench.settings))
+    # By waves for all depths of the weights.
+    margin = BEYOND_DEPTHS * content.camera.scale(bench.settings.media_model()).depth_mm
+    low, high = content.weights.padded.grid.bounds_mm(2)
+    view = _view(bench, light_of(bench.settings, (low - margin, high + margin)))
     return task_of(
         frame.image,
         view,
@@ -288,13 +291,6 @@ def _view(bench: Bench, waves: Light | None) -> View:
     calibration, space = content.weights.calibration, _space(content, settings)
     # Particles are fitted behind arrays that stand upright, as in the weights' frame.
     return raw_view(content.camera, settings.media_model(), radius, calibration, space, waves, content.passed)
-
-
-def _light(content: WeightsFile, settings: Config) -> Light | None:
-    """Return the light as waves where its wavelength is given, for all depths of the weights; None: by rays."""
-    margin = BEYOND_DEPTHS * content.camera.scale(settings.media_model()).depth_mm
-    low, high = content.weights.padded.grid.bounds_mm(2)
-    return light_of(settings, (low - margin, high + margin))
 
 
 def light_of(settings: Config, depths_mm: tuple[float, float]) -> Light | None:

@@ -93,10 +93,6 @@ def of_vectors(
     return figures | _of_statistics(field, arrays, tables, said)
 
 
-def _of_vectors_in(path: Path) -> Figures:
-    return of_vectors(vtkhdf.open_vectors(path), *vtkhdf.read_extra(path), vtkhdf.read_header(path).attributes)
-
-
 def _of_statistics(
     field: VectorField,
     arrays: Mapping[str, NDArray[Any]],
@@ -251,7 +247,9 @@ def _light_of(content: WeightsFile) -> Figure:
 
 
 READERS: dict[str, Callable[[Path], Figures]] = {
-    vtkhdf.VECTORS_FORMAT: _of_vectors_in,
+    vtkhdf.VECTORS_FORMAT: lambda path: of_vectors(
+        vtkhdf.open_vectors(path), *vtkhdf.read_extra(path), vtkhdf.read_header(path).attributes
+    ),
     vtkhdf.VOLUME_FORMAT: lambda path: of_volume(vtkhdf.open_volume(path)),
     TRACKS_FORMAT: lambda path: of_tracks(particle_file.open_tracks(path)),
     TRAJECTORIES_FORMAT: lambda path: of_trajectories(particle_file.open_tracks(path)),

@@ -17,7 +17,7 @@ from lfpiv_cli.errors import InputError, UsageError
 from lfpiv_cli.files import images as image_files
 from lfpiv_cli.files import vtkhdf
 from lfpiv_cli.files.atomic import ensure_writable, folder_of
-from lfpiv_cli.files.batch import Target, frames_of, output_paths
+from lfpiv_cli.files.batch import Target, frames_of, images_seen, output_paths
 from lfpiv_cli.files.config import carried_config
 from lfpiv_cli.files.hdf5 import unpacked_bytes
 from lfpiv_cli.files.inputs import ensure_room
@@ -35,7 +35,7 @@ from lfpiv_cli.verbs import frames as of_frames
 from lfpiv_cli.verbs import particles
 from lfpiv_cli.verbs.batches import Batch, BatchOptions, Expected, Worked, carried_out
 from lfpiv_cli.verbs.frames import IMAGE, Bench, ImageOptions, Progress, ReadAhead
-from lfpiv_cli.verbs.pairs import PairOptions, image_pairs, watched, work_as_they_come
+from lfpiv_cli.verbs.pairs import PairOptions, found_pairs, watched, work_as_they_come
 from lfpiv_cli.verbs.particles import Finder, Prepared
 from lfpiv_cli.verbs.tracers import TracerSize, light_notices, size_notices
 from lfpiv_cli.verbs.weights_cost import COLUMN_S, FLOAT_BYTES, columns_bytes, held_bytes
@@ -228,7 +228,7 @@ class Reconstruction(Batch[Outcome]):
         self.inputs = [*self._common.values(), *images]
         self._frames = frames = frames_of(images, options.keep_going)
         if pairs is None and options.are_told:
-            pairs = image_pairs(frames, options)
+            pairs = found_pairs(images_seen(frames), options)
         self.notices = [] if pairs is None else pairs.settled(options.keep_going)
         self._beside = None if pairs is None else pairs.beside(len(frames))
         self._first_of = {} if pairs is None else pairs.first_of()

@@ -136,7 +136,9 @@ def report(
     fields = {path: open_vectors(path) for path in contents.of("vectors")[:MOST_FIELDS]}
     parts = judged(contents, fields)
     words = {part: checks.worst(lines, "good") for part, lines in parts.items()}
-    every = sorted((line for lines in parts.values() for line in lines), key=_by_file)
+    # By the files that they are about, if they are about one.
+    lines = (line for part in parts.values() for line in part)
+    every = sorted(lines, key=lambda line: (":" not in line.reason, natural(line.reason)))
     faults = [line for line in every if line.verdict in ("no", "look")]
     advice = "Nothing speaks against these vectors, as far as images and vectors tell it themselves."
     if faults:
@@ -158,11 +160,6 @@ def report(
         title = _sentence(contents, fields, len(faults))
         write_pages(Page(title, (advice,), (verdict,), tuple(sections), foot), [output], overwrite)
     return {"sentence": title, "files": len(contents.records), "pictures": drawer.count, "verdict": words}
-
-
-def _by_file(line: checks.Line) -> tuple[bool, list[str | int]]:
-    """Return what lines are ordered by: the file that they are about, if they are about one."""
-    return ":" not in line.reason, natural(line.reason)
 
 
 def _sentence(contents: Contents, fields: Fields, faults: int) -> str:

@@ -25,7 +25,7 @@ from lfpiv_cli.console import CONSOLE, Console
 from lfpiv_cli.errors import ConfigError, InputError, LfpivError, OutputExistsError, PartialError, UsageError
 from lfpiv_cli.files import images as image_files
 from lfpiv_cli.files.atomic import ensure_writable, write_text
-from lfpiv_cli.files.batch import Frame, frames_of, output_paths, pending
+from lfpiv_cli.files.batch import Frame, frames_of, images_seen, output_paths, pending
 from lfpiv_cli.files.calibration_file import open_calibration
 from lfpiv_cli.files.config import Config, load_rig
 from lfpiv_cli.files.inputs import ensure_regular_file, split_part
@@ -43,7 +43,7 @@ from lfpiv_cli.verbs.correlate import field_bytes
 from lfpiv_cli.verbs.follow import SEQUENCE_IS_WHOLE, TRACKS, follow_particles
 from lfpiv_cli.verbs.following import SHORTEST, ensure_sequence
 from lfpiv_cli.verbs.frames import Bench, Read, mask_of, other_frames, read_frame, reader
-from lfpiv_cli.verbs.pairs import image_pairs
+from lfpiv_cli.verbs.pairs import found_pairs
 from lfpiv_cli.verbs.report import ReportOptions, report
 from lfpiv_cli.verbs.run_steps import Chain, RunOptions, Steps, Vectors
 from lfpiv_cli.verbs.simulate import frame_names, simulate_board, simulate_particles, simulate_white
@@ -174,58 +174,6 @@ def measured(chain: Chain, choice: Choice, weights: Path) -> dict[str, Vectors]:
 
 def ensure_inputs(settings: Config, options: RunOptions) -> None:
     """Raise where settings, photographs or outputs are wrong, as far as it is known before the images are read."""
-    _ensure_settings(settings, options)
-    ensure_drawing()
-    if options.report:
-        ensure_pages()
-    ensure_pictures(len(options.white), len(options.board), len(options.depth_mm))
-    for path in (*options.white, *options.board):
-        ensure_regular_file(split_part(path)[0])
-    for path in filter(None, (options.dark, options.level.path, options.mask_file)):
-        image_files.read_reference(path, settings.image_shape())
-    if options.failures is not None:
-        ensure_writable(options.failures, overwrite=True)
-
-
-def _ensure_possible(settings: Config, options: RunOptions) -> tuple[list[Frame], Pairs]:
-    """Return the frames of the flow and their pairs, after all that can be known to be wrong has been asked for."""
-    ensure_inputs(settings, options)
-    frames = frames_of(options.images, options.keep_going)
-    if options.follow:
-        ensure_sequence(len(frames), SHORTEST)
-        pairs = Pairs(tuple(pairwise(range(len(frames)))), separate=False)
-    else:
-        pairs = image_pairs(frames, options)
-        pairs.settled(options.keep_going)
-    output_paths(Path(), [frame.stem for frame in frames])
-    _first_readable(frames, settings.image_shape(), options.keep_going)
-    if not options.keep_going:
-        for path in dict.fromkeys(frame.path for frame in frames):
-            if image_files.frames(path).shape != settings.image_shape():
-                image_files.read_image(path, 0, settings.image_shape())  # says what is wrong, before any is read
-    return frames, pairs
-
-
-def _first_readable(frames: Sequence[Frame], shape: tuple[int, int], keep_going: bool) -> int:
-    """Return the number of the first frame; of those that can be read, where the others are to go on.
-
-    Raises
-    ------
-    InputError : it cannot be read, or none can
-    """
-    for number, frame in enumerate(frames):
-        try:
-            read_frame(frame, shape)
-        except InputError:
-            if not keep_going or number == len(frames) - 1:
-                raise
-        else:
-            return number
-    raise InputError("no images were given")
-
-
-def _ensure_settings(settings: Config, options: RunOptions) -> None:
-    """Raise where the config lacks what a later step needs, or contradicts the methods that are asked for."""
     if options.dt_s is None and settings.correlation.dt_s is None:
         # Whether recordings say when each frame was taken, those that can be read.
         reported = []
@@ -260,6 +208,53 @@ def _ensure_settings(settings: Config, options: RunOptions) -> None:
         raise ConfigError(f"{settings.source}: reconstruction.solver: is particles; volumes need another one")
     if settings.weights.method == "dlfc" and (options.follow or by_particles):
         raise ConfigError(f"{settings.source}: weights.method: is dlfc, but particles are fitted with traced rays")
+    ensure_drawing()
+    if options.report:
+        ensure_pages()
+    ensure_pictures(len(options.white), len(options.board), len(options.depth_mm))
+    for path in (*options.white, *options.board):
+        ensure_regular_file(split_part(path)[0])
+    for path in filter(None, (options.dark, options.level.path, options.mask_file)):
+        image_files.read_reference(path, settings.image_shape())
+    if options.failures is not None:
+        ensure_writable(options.failures, overwrite=True)
+
+
+def _ensure_possible(settings: Config, options: RunOptions) -> tuple[list[Frame], Pairs]:
+    """Return the frames of the flow and their pairs, after all that can be known to be wrong has been asked for."""
+    ensure_inputs(settings, options)
+    frames = frames_of(options.images, options.keep_going)
+    if options.follow:
+        ensure_sequence(len(frames), SHORTEST)
+        pairs = Pairs(tuple(pairwise(range(len(frames)))), separate=False)
+    else:
+        pairs = found_pairs(images_seen(frames), options)
+        pairs.settled(options.keep_going)
+    output_paths(Path(), [frame.stem for frame in frames])
+    _first_readable(frames, settings.image_shape(), options.keep_going)
+    if not options.keep_going:
+        for path in dict.fromkeys(frame.path for frame in frames):
+            if image_files.frames(path).shape != settings.image_shape():
+                image_files.read_image(path, 0, settings.image_shape())  # says what is wrong, before any is read
+    return frames, pairs
+
+
+def _first_readable(frames: Sequence[Frame], shape: tuple[int, int], keep_going: bool) -> int:
+    """Return the number of the first frame; of those that can be read, where the others are to go on.
+
+    Raises
+    ------
+    InputError : it cannot be read, or none can
+    """
+    for number, frame in enumerate(frames):
+        try:
+            read_frame(frame, shape)
+        except InputError:
+            if not keep_going or number == len(frames) - 1:
+                raise
+        else:
+            return number
+    raise InputError("no images were given")
 
 
 def chosen(settings: Config, options: RunOptions, count_tracers: Callable[[], float | None]) -> Choice:

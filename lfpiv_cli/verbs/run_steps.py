@@ -316,13 +316,25 @@ class Chain:
     def vectors_by(self, method: FlowMethod, weights: Path) -> Vectors:
         """Measure the flow by volumes or by particles; return the files of vectors, none where tracks are all."""
         given, output = self.options, self.steps.output
+        tracks = output / TRACKS
         if method == "volumes" or self.pairs.separate:
             return self._by_pairs(method, weights)
-        if not given.follow:
-            return self._tracked_in_time(weights)
-        files, chosen = [*self._of_frames("particles"), output / TRACKS, output / PLAYBACK], self.following()
-        self._take("follow", files, lambda: follow_particles(weights, given.images, output, chosen, **self.common))
-        return {}
+        if given.follow:
+            files, chosen = [*self._of_frames("particles"), tracks, output / PLAYBACK], self.following()
+            self._take("follow", files, lambda: follow_particles(weights, given.images, output, chosen, **self.common))
+            return {}
+        found, failed = self._reconstructed("particles", weights)
+        if given.shard != ALL:
+            self.steps.console.say("tracks go through all frames: the same command without --shard makes them")
+            return {}
+        # The vectors of each interval.
+        grids = grid_paths(tracks, len(found) - 1)
+        if failed or len(self.pairs.pairs) < len(grids):
+            error = "a frame of the sequence is missing, and tracks would take those beside it for neighbours in time"
+            self.failures.append(Failure(TRACKS, error))
+            return {}
+        self._take("track", [tracks, *grids], lambda: self._worked(self._measured("particles")(found, tracks)))
+        return dict(enumerate(grids))
 
     def in_pairs(self, method: FlowMethod, found: Reconstruction, file_bytes: float | None = None) -> PairByPair[Any]:
         """Return the batch of pairs, each from its images to its vectors or tracks, of so many bytes if known."""
@@ -375,21 +387,6 @@ class Chain:
         self._take(name, made, make)
         lost = {failure.name for failure in self.failures}
         return {number: vectors[number] for number in numbers if paths[number].stem not in lost}
-
-    def _tracked_in_time(self, weights: Path) -> Vectors:
-        """Track particles through all frames; return the vectors of each interval."""
-        found, failed = self._reconstructed("particles", weights)
-        if self.options.shard != ALL:
-            self.steps.console.say("tracks go through all frames: the same command without --shard makes them")
-            return {}
-        tracks = self.steps.output / TRACKS
-        grids = grid_paths(tracks, len(found) - 1)
-        if failed or len(self.pairs.pairs) < len(grids):
-            error = "a frame of the sequence is missing, and tracks would take those beside it for neighbours in time"
-            self.failures.append(Failure(TRACKS, error))
-            return {}
-        self._take("track", [tracks, *grids], lambda: self._worked(self._measured("particles")(found, tracks)))
-        return dict(enumerate(grids))
 
     def following(self, dry_run: bool = False) -> FollowOptions:
         """Return the options of a sequence that is followed."""

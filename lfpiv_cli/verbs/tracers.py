@@ -175,97 +175,83 @@ def light_notices(points: Points, name: str) -> list[Notice]:
     noise_share = measured["read_noise_counts"] / max(measured["residual_rms_counts"], measured["read_noise_counts"])
     unexplained = measured["residual"] * float(np.sqrt(1.0 - min(noise_share, 1.0) ** 2))
     count, notices = len(points.position_mm), haze_notices(measured, name)
+
+    def against(code: str, text: str, remedy: str, figure: float, expected: str) -> None:
+        notices.append(Notice(code, name, text, remedy, figure, expected))
+
     found = measured["particles_per_lens"]
     crowd = max(found, measured.get("tracers_per_lens", 0.0))
     # Of crowds particles that are none end anywhere.
     beyond = measured.get("beyond_depths", 0.0) if crowd <= LARGEST_CROWD else 0.0
     alike = measured.get("residual_alike", MUCH_ALIKE)
     if unexplained > LARGEST_UNEXPLAINED:
-        notices.append(
-            Notice(
-                "light-unexplained",
-                name,
-                f"{count or 'no'} particles found, and {unexplained:.0%} of the light is not explained by them, at "
-                f"most {LARGEST_UNEXPLAINED:.0%} of a good image's",
-                "check the calibration (refine-calibration), particle_diameter_mm, --dark, --background and the volume",
-                unexplained,
-                f"at most {LARGEST_UNEXPLAINED:g}",
-            )
+        against(
+            "light-unexplained",
+            f"{count or 'no'} particles found, and {unexplained:.0%} of the light is not explained by them, at "
+            f"most {LARGEST_UNEXPLAINED:.0%} of a good image's",
+            "check the calibration (refine-calibration), particle_diameter_mm, --dark, --background and the volume",
+            unexplained,
+            f"at most {LARGEST_UNEXPLAINED:g}",
         )
     elif beyond > max(MOST_BEYOND, FEWEST_BEYOND / max(count, 1)):
-        notices.append(
-            Notice(
-                "light-unexplained",
-                name,
-                f"{beyond:.0%} of the particles end at the first or last depth in which they are sought, at most "
-                f"{MOST_BEYOND:.0%} of a good volume's: tracers from further away light the image",
-                "a deeper volume, or a thinner light sheet",
-                beyond,
-                f"at most {MOST_BEYOND:g}",
-            )
+        against(
+            "light-unexplained",
+            f"{beyond:.0%} of the particles end at the first or last depth in which they are sought, at most "
+            f"{MOST_BEYOND:.0%} of a good volume's: tracers from further away light the image",
+            "a deeper volume, or a thinner light sheet",
+            beyond,
+            f"at most {MOST_BEYOND:g}",
         )
     elif (unexplained > MUCH_LEFT and alike > LEAST_ALIKE) or unexplained * np.sqrt(alike) > MUCH_LEFT_ALIKE:
-        notices.append(
-            Notice(
-                "light-model",
-                name,
-                f"{unexplained:.0%} of the light is not that of the particles found by {measured['light']}, and "
-                f"{alike:.0%} of what is left is alike in pixels side by side; at most {MUCH_LEFT:.0%} is left, or "
-                "noise, where the model is right and few are missing: stated errors may be too small",
-                "give reconstruction.wavelength_nm, as lenses diffract"
-                if measured["light"] == "rays"
-                else "check the calibration, wavelength_nm and diffusion_px",
-                unexplained,
-                f"at most {MUCH_LEFT:g}",
-            )
+        against(
+            "light-model",
+            f"{unexplained:.0%} of the light is not that of the particles found by {measured['light']}, and "
+            f"{alike:.0%} of what is left is alike in pixels side by side; at most {MUCH_LEFT:.0%} is left, or "
+            "noise, where the model is right and few are missing: stated errors may be too small",
+            "give reconstruction.wavelength_nm, as lenses diffract"
+            if measured["light"] == "rays"
+            else "check the calibration, wavelength_nm and diffusion_px",
+            unexplained,
+            f"at most {MUCH_LEFT:g}",
         )
     if crowd > LARGEST_CROWD:
         counted = (
             f", {written(found)} found of {written(crowd)} by how unevenly they light them" if crowd > found else ""
         )
-        notices.append(
-            Notice(
-                "particles-crowded",
-                name,
-                f"{written(crowd)} particles for each microlens{counted}, at most {LARGEST_CROWD:g}: beyond, "
-                "neighbours are taken for one another, and standard errors do not know of it",
-                "fewer tracers, or volumes and their correlation; --background, where other light is in the image",
-                crowd,
-                f"at most {LARGEST_CROWD:g}",
-            )
+        against(
+            "particles-crowded",
+            f"{written(crowd)} particles for each microlens{counted}, at most {LARGEST_CROWD:g}: beyond, "
+            "neighbours are taken for one another, and standard errors do not know of it",
+            "fewer tracers, or volumes and their correlation; --background, where other light is in the image",
+            crowd,
+            f"at most {LARGEST_CROWD:g}",
         )
     ambiguous = measured.get("depth_ambiguous", 0.0)
     if ambiguous > MOST_AMBIGUOUS:
-        notices.append(
-            Notice(
-                "depth-ambiguous",
-                name,
-                f"another depth explains the light of {ambiguous:.0%} of the particles about as well, at most "
-                f"{MOST_AMBIGUOUS:.0%} of usual tracers': near the focal plane one lens or two hold it all. Their "
-                "stated errors cover both depths",
-                "a volume that lies beside the focal plane, or more light; reconstruction.wavelength_nm, as lenses "
-                "diffract",
-                ambiguous,
-                f"at most {MOST_AMBIGUOUS:g}",
-            )
+        against(
+            "depth-ambiguous",
+            f"another depth explains the light of {ambiguous:.0%} of the particles about as well, at most "
+            f"{MOST_AMBIGUOUS:.0%} of usual tracers': near the focal plane one lens or two hold it all. Their "
+            "stated errors cover both depths",
+            "a volume that lies beside the focal plane, or more light; reconstruction.wavelength_nm, as lenses "
+            "diffract",
+            ambiguous,
+            f"at most {MOST_AMBIGUOUS:g}",
         )
     off, largest = measured.get("microlens_focus", 0.0), LARGEST_FOCUS_ERROR * max(unexplained / MUCH_LEFT, crowd, 1.0)
     if abs(off) > max(largest, CERTAIN_SIGMAS * measured.get("microlens_focus_sigma", 0.0)):
         least = "at least " if measured.get("light") == "waves" else ""
-        notices.append(
-            Notice(
-                "microlens-focus",
-                name,
-                f"by the tracers' light under single microlenses their focal length is {least}{abs(off):.1%} "
-                f"{'longer' if off > 0.0 else 'shorter'} than the rig says, at most {largest:.1%} of a good one, or "
-                "microlens_distance_mm is as much off the other way: depths are off, and stated errors too small",
-                f"microlenses.focal_length_mm {written(1.0 + off, 4)} times as large, and build the weights again "
-                "until it stays",
-                off,
-                f"within {largest:g}",
-            )
+        against(
+            "microlens-focus",
+            f"by the tracers' light under single microlenses their focal length is {least}{abs(off):.1%} "
+            f"{'longer' if off > 0.0 else 'shorter'} than the rig says, at most {largest:.1%} of a good one, or "
+            "microlens_distance_mm is as much off the other way: depths are off, and stated errors too small",
+            f"microlenses.focal_length_mm {written(1.0 + off, 4)} times as large, and build the weights again "
+            "until it stays",
+            off,
+            f"within {largest:g}",
         )
     if not count and all(each.code == "haze" for each in notices):
         text = "no particles found: nothing stands out of the noise"
-        notices.append(Notice("no-particles", name, text, "check exposure, --dark and --mask", 0.0, "some"))
+        against("no-particles", text, "check exposure, --dark and --mask", 0.0, "some")
     return notices

@@ -19,7 +19,7 @@ from lfpiv_cli.files.config import Config
 from lfpiv_cli.files.hdf5 import fault_of
 from lfpiv_cli.files.inputs import given
 from lfpiv_cli.files.pairing import Pairs, in_order
-from lfpiv_cli.files.provenance import carried_record, record, with_warnings
+from lfpiv_cli.files.provenance import carried_record, record, seconds_between, with_warnings
 from lfpiv_cli.flow.field import REJECTED
 from lfpiv_cli.grid import Reference
 from lfpiv_cli.names import GridMethod
@@ -174,7 +174,7 @@ class Tracks(PairBatch[Outcome, TrackOptions]):
         with _tracks(paths, read, settings, chosen, dict(target.record), target.path.parent) as found:
             roles = zip(_roles(paths).items(), records, strict=True)
             reported = {f"{role} {path.name}": made for (role, path), made in roles}
-            doubts = dt_notices(chosen.dt_s, pairwise(records), paths[0].name)
+            doubts = dt_notices(chosen.dt_s, (seconds_between(*pair) for pair in pairwise(records)), paths[0].name)
             few = checks.few_notices(counts, [path.name for path in paths], found.summary, found.points)
             notices = [*doubts, *checks.calibration_notices(reported), *few]
             work.console.warn(notices)

@@ -306,7 +306,10 @@ def _truth_of_particles(path: Path, centres_mm: Floats) -> tuple[Floats, NDArray
 
 def validate_all(config: Path, output: Path, *, overwrite: bool = False, console: Console = CONSOLE) -> dict[str, Any]:
     """Write every report into one folder; a limit that one of them misses does not keep the others from being made."""
-    ensure_complete(config)
+    # What the last of the reports needs, before the first is made.
+    settings = load_rig(config)
+    depths_in_volume(settings)
+    ensure_experiment(settings)
     stages: dict[str, Callable[..., dict[str, Any]]] = {
         "weights": validate_weights,
         "board": validate_board,
@@ -324,10 +327,3 @@ def validate_all(config: Path, output: Path, *, overwrite: bool = False, console
     if missed:
         raise LimitMissedError("; ".join(missed), summary)
     return summary
-
-
-def ensure_complete(config: Path) -> None:
-    """Refuse a config that lacks what the last of the reports needs before the first is made (ConfigError)."""
-    settings = load_rig(config)
-    depths_in_volume(settings)
-    ensure_experiment(settings)

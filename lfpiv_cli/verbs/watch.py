@@ -147,7 +147,8 @@ class Watching:
                 self._waiting = []
                 return False
             self.console.say(f"by {' and '.join(self._choice.methods)}: {self._choice.reason}")
-            self._latest.begin()
+            head = "velocities are means, ± the usual standard error of one vector"
+            self.console.answer(f"{', '.join(HEAD)}; {head}")
         if "particles" not in self._choice.methods or self._prepared.size is not None:
             return True
         bench, read = bench_and_reader(chain, self._weights)
@@ -208,10 +209,6 @@ class Latest:
     console: Console
     draws: bool
     _rows: deque[tuple[str, ...]] = field(default_factory=lambda: deque(maxlen=LISTED))
-
-    def begin(self) -> None:
-        """Say what lines tell."""
-        self.console.answer(f"{', '.join(HEAD)}; velocities are means, ± the usual standard error of one vector")
 
     def failed(self, name: str, error: str) -> None:
         """Tell of a pair that could not be measured."""
