@@ -16,6 +16,7 @@ from lfpiv_cli.grid import Grid, Reference
 from lfpiv_cli.optics.camera import Lattice
 from lfpiv_cli.optics.tracing import ObjectSpace
 from lfpiv_cli.validation.board import DEPTH_DEFINITIONS, board_figures, elongation_mm, gaussian_centre_mm, measure_dots
+from lfpiv_cli.validation.flow import limits_missed
 from lfpiv_cli.validation.volume import (
     known_volume,
     match,
@@ -35,7 +36,6 @@ from lfpiv_cli.validation.weights import (
     similarity_figure,
     ssim,
     weights_figures,
-    weights_limits_missed,
 )
 from tests.commands import CONFIG, run, table2_rig
 
@@ -267,11 +267,14 @@ def test_ssim_eq_16_and_figures_of_a_column_by_hand(rng):
     figures = compare_columns(reference, image)
     assert figures["l1"] == pytest.approx(0.2)
     assert figures["rmse_grey"] == pytest.approx(510.0 * np.sqrt(0.02 / 4))
-    figures = {"a": {"ssim_smallest": 0.9, "l1_mean": 0.02}, "b": None}
-    assert weights_limits_missed(figures, {"a": {"ssim_smallest": 0.8, "l1_mean": 0.03}, "b": {"l1_mean": None}}) == []
-    assert (
-        len(weights_limits_missed(figures, {"a": {"ssim_smallest": 0.95, "l1_mean": 0.01}, "b": {"l1_mean": 0.1}})) == 3
-    )
+    figures = {"a.ssim_smallest": 0.9, "a.l1_mean": 0.02}
+    assert limits_missed(figures, {"a.ssim_smallest": 0.8, "a.l1_mean": 0.03, "b.l1_mean": None}) == []
+    missed = limits_missed(figures, {"a.ssim_smallest": 0.95, "a.l1_mean": 0.01, "b.l1_mean": 0.1})
+    assert [each.rpartition(",")[0] for each in missed] == [
+        "a.ssim_smallest is 0.9",
+        "a.l1_mean is 0.02",
+        "b.l1_mean is unknown",
+    ]
 
 
 def _local_ssim_at_middle(a: np.ndarray, b: np.ndarray) -> float:

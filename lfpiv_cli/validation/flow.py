@@ -22,6 +22,7 @@ from lfpiv_cli.arrays import Flags, Floats, Integers
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.flow.field import FLAG_NAMES, MM_TO_M, VectorField
 from lfpiv_cli.flow.windows import RoundWall
+from lfpiv_cli.notice import written
 from lfpiv_cli.synthetic.flows import Flow
 
 # The paper's Fig. 18: the share of vectors within a quarter of the truth.
@@ -30,8 +31,8 @@ TOLERANCE = 0.25
 CUMULATIVE_STEPS = 101
 # A mean flow slower than this share of the mean speed is the remainder of a flow that has no direction (a vortex).
 SMALLEST_MEAN_FLOW = 0.05
-# Figures whose limit is the largest size allowed; of the others it is the smallest.
-LARGEST_ALLOWED = ("streamwise_mean_error", "slice_mean_error")
+# How figures end whose limit is the largest size allowed, of flows and of weights; of the others it is the smallest.
+LARGEST_ALLOWED = ("mean_error", "rmse_grey_largest", "l1_mean", "l1_largest")
 # Particles that a local linear fit takes: seven times its four unknowns, and close enough to the size of a window.
 FIT_PARTICLES = 28
 # Figures of each component, and their units.
@@ -261,22 +262,22 @@ def truth_at_points(positions_mm: Floats, velocities: Floats, centres_mm: Floats
 
 
 def limits_missed(figures: Mapping[str, Any], limits: Mapping[str, float | None]) -> list[str]:
-    """Return a sentence for each figure of `flow_figures` that misses its limit; a figure that is unknown misses.
+    """Return a sentence for each figure that misses its limit; a figure that is unknown misses.
 
     Parameters
     ----------
-    limits : by the name of the figure: the largest size of those in `LARGEST_ALLOWED`, the smallest of others; None
-        where there is no limit
+    limits : by the name of the figure: the largest size of those that end as in `LARGEST_ALLOWED`, the smallest of
+        others; None where there is no limit
     """
     missed = []
     for name, limit in limits.items():
         figure = figures.get(name)
         if limit is None:
             continue
-        largest = name in LARGEST_ALLOWED
+        largest = name.endswith(LARGEST_ALLOWED)
         if figure is None or (abs(figure) > limit if largest else figure < limit):
             allowed = f"at most {limit} is allowed" if largest else f"at least {limit} is asked for"
-            missed.append(f"{name} is {figure}, {allowed}")
+            missed.append(f"{name} is {'unknown' if figure is None else written(figure, 6)}, {allowed}")
     return missed
 
 

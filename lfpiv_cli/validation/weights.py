@@ -246,24 +246,6 @@ def weights_figures(columns: list[Column], long_count: Integers) -> dict[str, An
     return figures | {"voxels": voxels}
 
 
-def weights_limits_missed(figures: dict[str, Any], limits: dict[str, dict[str, float | None]]) -> list[str]:
-    """Return a sentence for each limit that is missed; a limit that cannot be judged is missed too.
-
-    Limits are given by comparison and figure; those on SSIM are lower ones.
-    """
-    missed = []
-    for comparison, each in limits.items():
-        for figure, limit in each.items():
-            if limit is None:
-                continue
-            value = (figures[comparison] or {}).get(figure)
-            if value is None:
-                missed.append(f"{comparison}.{figure} could not be judged")
-            elif (value < limit) if figure.startswith("ssim") else (value > limit):
-                missed.append(f"{comparison}.{figure} is {written(value, 4)}, the limit {limit:g}")
-    return missed
-
-
 SHOWN = {
     "drt_exact": "DRT, exact",
     "ert": "ERT, converged",

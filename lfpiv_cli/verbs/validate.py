@@ -19,7 +19,7 @@ from lfpiv_cli.files.inputs import given
 from lfpiv_cli.files.pages import ensure_drawing, write_picture
 from lfpiv_cli.files.particles import MM_PER_M, read_particles
 from lfpiv_cli.files.provenance import record
-from lfpiv_cli.files.sections_work import FlowSection
+from lfpiv_cli.files.sections_work import ColumnLimits, FlowSection
 from lfpiv_cli.flow.field import VectorField
 from lfpiv_cli.flow.windows import RoundWall
 from lfpiv_cli.names import FlowMethod, Moment
@@ -106,19 +106,19 @@ def validate_weights(
     with console.progress(len(centres), "validate weights") as advance:
         columns = of_weights.make_columns(camera, space, grid, centres, rng, long_count, advance)
     figures = of_weights.weights_figures(columns, long_count)
-    missed = of_weights.weights_limits_missed(figures, chosen.limits.model_dump())
+    judged = {name: each for name, each in figures.items() if isinstance(each, dict)}
+    summary, limits = (
+        {f"{name}.{figure}": value for name, each in table.items() for figure, value in each.items()}
+        for table in (judged, chosen.limits.model_dump())
+    )
+    missed = limits_missed(summary, limits)
     provenance = record("validate weights", settings.resolved(), {"config": config})
     write_json(paths[".json"], {"figures": figures, "limits_missed": missed, "provenance": provenance}, overwrite)
     shown = min(len(of_weights.TABLE1_MM), len(columns))
     names = of_weights.SHOWN if scene is None else of_weights.SHOWN_BEHIND_FACES
     write_picture(paths["_columns.png"], of_weights.columns_figure(columns[:shown], names), overwrite)
     write_picture(paths["_similarity.png"], of_weights.similarity_figure(figures, shown), overwrite)
-    summary = {
-        f"{name}.{figure}": each[figure]
-        for name, each in figures.items()
-        if isinstance(each, dict)
-        for figure in ("ssim_smallest", "rmse_grey_largest", "l1_mean", "l1_largest")
-    }
+    summary = {name: value for name, value in summary.items() if name.rpartition(".")[2] in ColumnLimits.model_fields}
     if missed:
         raise LimitMissedError(f"{paths['.json']}: {'; '.join(missed)}", summary)
     return {"voxels": len(columns)} | summary
