@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -210,11 +211,7 @@ def refine_calibration(
     waves = None if reported is None else Light(reported.wavelength_mm, reported.diffusion_px, grid.bounds_mm(2))
     view = raw_view(camera, media, 0.5 * (given or UNKNOWN_LENSES * scale.lens_mm), calibration, light=waves)
     weights = Weights.factorised(camera, media, grid, calibration)
-    sums = normalisers(weights.padded)
-
-    def task(image: Singles, seen: View) -> Task:
-        return task_of(image, seen, weights, camera, sums)
-
+    task = partial(task_of, weights=weights, camera=camera, sums=normalisers(weights.padded))
     if given is None and (measured := diameter_by([task(images[0], view)])):
         view = with_radius(view, 0.5 * scale.lens_mm * measured.lenses)
     fit, first = first_image(task(images[0], view), view, grid.bounds_mm(2), progress)

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -28,7 +29,7 @@ from lfpiv_cli.optics.curved_space import CurvedSpace
 from lfpiv_cli.optics.shapes import ScenePose
 from lfpiv_cli.particles.diameter import UNKNOWN_LENSES, diameter_by
 from lfpiv_cli.particles.rounds import find_particles
-from lfpiv_cli.particles.search import Task, task_of
+from lfpiv_cli.particles.search import task_of
 from lfpiv_cli.particles.view import View, footprint_radius_mm, on_array_mm, raw_view, with_radius
 from lfpiv_cli.reconstruction.solvers import normalisers
 from lfpiv_cli.self_calibration.nuisances import (
@@ -229,11 +230,7 @@ def refine_scene(
     for number in range(SEARCHES):
         seen = start.applied(view, scene)
         weights = _weights(scene, start.scene, volume, calibration, seen)
-        sums = normalisers(weights.padded)
-
-        def task(image: Singles, seen: View, weights: Weights = weights, sums: Any = sums) -> Task:
-            return task_of(image, seen, weights, camera, sums)
-
+        task = partial(task_of, weights=weights, camera=camera, sums=normalisers(weights.padded))
         if number == 0 and given is None and (measured := diameter_by([task(images[0], seen)])):
             view = with_radius(view, 0.5 * lens_mm * measured.lenses)
             seen = start.applied(view, scene)
