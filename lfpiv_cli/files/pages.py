@@ -8,8 +8,10 @@ from __future__ import annotations
 import base64
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import partial
+from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from lfpiv_cli.errors import UsageError
 from lfpiv_cli.files.atomic import write_text, written_atomically
@@ -19,17 +21,22 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-# Pictures to look at, written like every other output. Drawing needs the optional package matplotlib.
+# Pictures to look at, written like every other output.
 
 DOTS_PER_INCH = 110
 
 
-def ensure_drawing() -> None:
-    """Refuse pictures, before anything is computed, where matplotlib is not installed."""
+def package(name: str, extra: str, what: str = "this") -> Any:
+    """Return an optional package, in whose absence the error names which of our extras has it (UsageError)."""
     try:
-        import matplotlib  # noqa: F401
+        return import_module(name)
     except ImportError as error:
-        raise UsageError('pictures need matplotlib: pip install "lfpiv[plot]"') from error
+        raise UsageError(f'{what} needs {name}: pip install "lfpiv[{extra}]"') from error
+
+
+# To refuse pictures and pages before anything is computed.
+ensure_drawing = partial(package, "matplotlib", "plot", "a picture")
+ensure_pages = partial(package, "jinja2", "report", "a report")
 
 
 def write_picture(path: Path, figure: Figure, overwrite: bool) -> None:
@@ -103,14 +110,6 @@ class Page:
     sections: tuple[Section, ...]
     foot: str
     reload_s: int | None = None
-
-
-def ensure_pages() -> None:
-    """Refuse pages, before anything is computed, where Jinja2 is not installed."""
-    try:
-        import jinja2  # noqa: F401
-    except ImportError as error:
-        raise UsageError('reports need Jinja2: pip install "lfpiv[report]"') from error
 
 
 def write_pages(page: Page, targets: Iterable[Path], overwrite: bool) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from lfpiv_cli.errors import UsageError
 from lfpiv_cli.files import particle_file
 from lfpiv_cli.files.export_formats import Content, columns_of, content_of
+from lfpiv_cli.files.pages import ensure_drawing, package
 from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, POSITION, TRACKS_FORMAT, TRAJECTORIES_FORMAT, Points
 from lfpiv_cli.files.vtkhdf import VECTORS_FORMAT, VOLUME_FORMAT, Volume, write_vectors, write_volume
 from lfpiv_cli.flow.field import VectorField
@@ -239,7 +239,7 @@ def save(result: Result, path: Path | str, overwrite: bool) -> None:
 
 def draw(result: Result, name: str | None) -> Any:
     """Return a figure of a result, the first where no name is given."""
-    _package("matplotlib", "plot")
+    ensure_drawing()
     from lfpiv_cli.verbs import plot
 
     function, of = _kind_of(result).figures(result)
@@ -248,14 +248,6 @@ def draw(result: Result, name: str | None) -> Any:
     if chosen not in figures:
         raise UsageError(f"plot({chosen!r}): {type(result).__name__} has the figures {', '.join(figures)}")
     return figures[chosen].draw()
-
-
-def _package(name: str, extra: str) -> Any:
-    """Return an optional package, in whose absence the error names which of our extras has it (UsageError)."""
-    try:
-        return import_module(name)
-    except ImportError as error:
-        raise UsageError(f'this needs {name}: pip install "lfpiv[{extra}]"') from error
 
 
 def _content_of(result: Result) -> Content:
@@ -267,7 +259,7 @@ def _content_of(result: Result) -> Content:
 
 def as_dataset(result: Result) -> Any:
     """Return the arrays of a result as an `xarray.Dataset`, named and described."""
-    xarray, content = _package("xarray", "arrays"), _content_of(result)
+    xarray, content = package("xarray", "arrays"), _content_of(result)
     places = ("point",) if content.grid is None else ("z", "y", "x")
     coordinates: dict[str, Any] = {}
     if content.grid is not None:
@@ -285,7 +277,7 @@ def as_dataset(result: Result) -> Any:
 
 def as_table(result: Result) -> Any:
     """Return the arrays of a result as a `pandas.DataFrame`, its columns described."""
-    pandas, content = _package("pandas", "arrays"), _content_of(result)
+    pandas, content = package("pandas", "arrays"), _content_of(result)
     columns, units = columns_of(content)
     table = pandas.DataFrame(columns)
     table.attrs = content.reported() | {"units": units, "long_name": content.descriptions()}
