@@ -180,7 +180,9 @@ def follow_particles(
         # What is made the second time can be written, which is to be known before the first.
         there_again = pending([last.targets[k] for k in there], last.inputs, overwrite, options.resume, dry=True)
         last.ensure_residuals([there[k] for k in there_again])
-    sequence, said = _recorded(weights, content, settings, tracking, frames, ways[0], options, console)
+    sequence, said = _recorded(
+        searchable_weights(weights, content, settings), settings, tracking, frames, ways[0], options, console
+    )
 
     chosen = BatchOptions(
         resume=options.resume, keep_going=options.keep_going, time_limit_s=options.time_limit_s, begun_s=options.begun_s
@@ -199,7 +201,6 @@ def follow_particles(
 
 
 def _recorded(
-    weights: Path,
     content: WeightsFile,
     settings: Config,
     tracking: Tracking,
@@ -209,7 +210,7 @@ def _recorded(
     console: Console,
 ) -> tuple[Recorded, list[Notice]]:
     """Return the sequence as it is followed, its tracers' size known; and what is said of that."""
-    content, shape = searchable_weights(weights, content, settings), content.image_shape
+    shape = content.image_shape
     dark = options.dark_image(shape)
     pitch_px = float(content.camera.micro_image_lattice_px().pitch.max())
     bench = of_frames.bench_of(

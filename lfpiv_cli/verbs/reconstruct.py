@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -193,51 +193,54 @@ class _Ready:
     said: Sequence[Notice]
 
 
+@dataclass(eq=False, repr=False)
 class Reconstruction(Batch[Outcome]):
-    """The batch of `reconstruct`: a volume, or particles, for each frame."""
+    """The batch of `reconstruct`: a volume, or particles, for each frame.
 
+    Attributes
+    ----------
+    pairs, prepared : where these are known already
+    only : the numbers of the frames that are to be made, in their order; None: all
+    weights_to_come : where the weights are to carry another record before anything is made
+
+    Raises
+    ------
+    LfpivError : frames or outputs do not go together, or a file cannot be opened
+    """
+
+    weights: Path
+    images: Sequence[Path]
+    output: Path
+    options: ReconstructOptions
+    overwrite: bool
+    pairs: Pairs | None = None
+    prepared: Prepared | None = None
+    only: Sequence[int] | None = None
+    weights_to_come: Gone | None = None
+    names: Sequence[str] = field(init=False, default=())
+    order: Sequence[int] = field(init=False, default=())
     label, unit = "reconstruct", "frame"
-    names: Sequence[str] = ()
-    order: Sequence[int] = ()
 
-    def __init__(
-        self,
-        weights: Path,
-        images: Sequence[Path],
-        output: Path,
-        options: ReconstructOptions,
-        overwrite: bool,
-        pairs: Pairs | None = None,
-        prepared: Prepared | None = None,
-        order: Sequence[int] | None = None,
-        weights_to_come: Gone | None = None,
-    ) -> None:
-        """Take the arguments of `reconstruct`; see which frames there are, and read no image.
-
-        `pairs` and `prepared`, where these are known already; `order`, where only some frames are to be made;
-        `weights_to_come`, where the weights are to carry another record before anything is made.
-
-        Raises
-        ------
-        LfpivError : frames or outputs do not go together, or a file cannot be opened
-        """
-        self._options, self.overwrite, self._prepared = options, overwrite, prepared or Prepared()
+    def __post_init__(self) -> None:
+        """See which frames there are, and read no image."""
+        options, weights, pairs, to_come = self.options, self.weights, self.pairs, self.weights_to_come
+        self._prepared = self.prepared or Prepared()
         # What is complete is skipped: in the place of what is made there is nothing, or something broken.
-        self._replace = overwrite or options.resume
+        self._replace = self.overwrite or options.resume
         self._common = options.files(weights)
-        self.inputs = [*self._common.values(), *images]
-        self._frames = frames = frames_of(images, options.keep_going)
+        self.inputs = [*self._common.values(), *self.images]
+        self._frames = frames = frames_of(self.images, options.keep_going)
         if pairs is None and options.are_told:
             pairs = found_pairs(images_seen(frames), options)
         self.notices = [] if pairs is None else pairs.settled(options.keep_going)
         self._beside = None if pairs is None else pairs.beside(len(frames))
         self._first_of = {} if pairs is None else pairs.first_of()
         self._every = list(range(len(frames))) if pairs is None else pairs.order(len(frames))
-        self.order = self._every if order is None else order
+        self.order = self._every if self.only is None else self.only
         self.names = [frame.stem for frame in frames]
-        self._paths = output_paths(output, self.names)
-        self._gone = {} if weights_to_come is None else {weights: weights_to_come}
-        carried = read_weights_record(weights) if weights_to_come is None else weights_to_come.record
+        self._paths = output_paths(self.output, self.names)
+        self._gone = {} if to_come is None else {weights: to_come}
+        carried = read_weights_record(weights) if to_come is None else to_come.record
         self._settings = carried_config(carried, weights).overridden_by("reconstruction", options)
         solver = self._settings.reconstruction.solver
         self._as_particles = solver == "particles"
@@ -267,7 +270,7 @@ class Reconstruction(Batch[Outcome]):
 
     def begin(self, numbers: Sequence[int], console: Console) -> float:
         """Open the weights, and prepare what all frames share."""
-        options, settings, frames = self._options, self._settings, self._frames
+        options, settings, frames = self.options, self._settings, self._frames
         if self._as_particles and options.residual:
             for number in numbers:
                 ensure_writable(of_frames.residual_path(self._paths[number]), self._replace)
@@ -339,7 +342,7 @@ class Reconstruction(Batch[Outcome]):
         points = particles.points_of(bench, frame, found, ready.size, made)
         of_light = light_notices(points, target.path.name)
         work.console.warn(of_light)
-        if self._options.residual:
+        if self.options.residual:
             left = particles.what_is_left(frame, found)
             # Made again whenever the particles are: an interrupted batch may have left one without them.
             image_files.write_tiff(of_frames.residual_path(target.path), left.astype(np.float32), overwrite=True)

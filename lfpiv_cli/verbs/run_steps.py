@@ -212,38 +212,38 @@ BATCHES: dict[FlowMethod, tuple[type[Correlation | Tracks], Any]] = {
 Vectors = dict[int, Path]
 
 
+@dataclass
 class Chain:
     """The steps, as the options of a run have them.
 
     Attributes
     ----------
-    failures : frames and pairs that could not be worked on
+    config, settings : the rig file, and what it says
     pairs : of all frames
+    prepared : what steps share that takes long to open
+    failures : frames and pairs that could not be worked on
     share : the numbers of the pairs that are to be measured
     order : those of the frames that this takes, and in the last share those without a partner
     """
 
-    def __init__(
-        self,
-        config: Path,
-        settings: Config,
-        options: RunOptions,
-        frames: Sequence[Frame],
-        pairs: Pairs,
-        steps: Steps,
-        overwrite: bool,
-        prepared: Prepared | None = None,
-    ) -> None:
-        """Take the frames and which of them belong together, and what steps share."""
-        self.config, self.settings, self.options, self.frames, self.steps = config, settings, options, frames, steps
-        shard = options.shard
+    config: Path
+    settings: Config
+    options: RunOptions
+    frames: Sequence[Frame]
+    pairs: Pairs
+    steps: Steps
+    overwrite: bool
+    prepared: Prepared = field(default_factory=Prepared)
+
+    def __post_init__(self) -> None:
+        """See what belongs to this share."""
+        shard, pairs = self.options.shard, self.pairs
         self.share = shard.of(range(len(pairs.pairs)))
         ours = [pairs.pairs[number] for number in self.share]
-        alone = pairs.order(len(frames))[len({k for pair in pairs.pairs for k in pair}) :]
+        alone = pairs.order(len(self.frames))[len({k for pair in pairs.pairs for k in pair}) :]
         self.order = list(dict.fromkeys([*(k for pair in ours for k in pair), *(alone if shard.is_last else [])]))
         # Of several shards the first one tells them.
         self.failures = failures_of(pairs) if shard.number == 1 else []
-        self.prepared, self.overwrite = prepared or Prepared(), overwrite
         self.pairs = replace(pairs, left_out=())
 
     @property
