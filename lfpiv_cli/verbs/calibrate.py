@@ -17,13 +17,11 @@ from lfpiv_cli.calibration.model import Calibration, DataSheet, Photographs
 from lfpiv_cli.calibration.white import by_aperture, lens_image_width
 from lfpiv_cli.console import CONSOLE, Console
 from lfpiv_cli.errors import ConfigError, UsageError
+from lfpiv_cli.files import atomic, calibration_file, pages
 from lfpiv_cli.files import images as image_files
-from lfpiv_cli.files.atomic import ensure_apart, ensure_writable
 from lfpiv_cli.files.batch import Target, is_kept
-from lfpiv_cli.files.calibration_file import open_calibration, write_calibration
 from lfpiv_cli.files.config import Config, load_rig
 from lfpiv_cli.files.inputs import given
-from lfpiv_cli.files.pages import ensure_drawing, write_picture
 from lfpiv_cli.files.provenance import record as provenance_record
 from lfpiv_cli.files.provenance import with_warnings
 from lfpiv_cli.notice import Notice, warn_of
@@ -224,11 +222,11 @@ def calibrate_snapshot(
     whites, boards = _numbered("white", white), _numbered("board", board)
     inputs = _inputs(config, options)
     drawings = [path for path in (picture, views) if path]
-    ensure_apart([output, *drawings], inputs.values())
+    atomic.ensure_apart([output, *drawings], inputs.values())
     for target in (output, *drawings):
-        ensure_writable(target, overwrite or options.resume)
+        atomic.ensure_writable(target, overwrite or options.resume)
     if drawings:
-        ensure_drawing()
+        pages.ensure_drawing()
     settings = load_rig(config)
     shape = settings.image_shape()
     # Before the record, for which whole files are read: what is no image is so at once.
@@ -237,7 +235,7 @@ def calibrate_snapshot(
     if options.resume:
         kept = is_kept([output], record, inputs.values(), overwrite)
         if kept and all(path.exists() for path in drawings):
-            return open_calibration(output).summary()
+            return calibration_file.open_calibration(output).summary()
         overwrite = True
     camera = settings.camera_model() if views else None
     pictures = photographs(
@@ -246,19 +244,19 @@ def calibrate_snapshot(
     calibration = calibration_of(settings, pictures)
     notices = calibration_notices(settings, pictures, calibration)
     console.warn(notices)
-    write_calibration(output, calibration, with_warnings(record, notices), overwrite)
+    calibration_file.write_calibration(output, calibration, with_warnings(record, notices), overwrite)
     if picture:
         from lfpiv_cli.pictures.calibration import calibration_figure
 
         shown = [frames[name] for name in whites] or [frames["board"]]
         sharpest = shown[by_aperture(shown, frames.get("dark"))[0]]
-        write_picture(picture, calibration_figure(calibration, sharpest, frames.get("board")), overwrite)
+        pages.write_picture(picture, calibration_figure(calibration, sharpest, frames.get("board")), overwrite)
     if views and camera:
         from lfpiv_cli.pictures.calibration import views_figure
 
         medium = settings.media_model() if board and settings.board.medium == "fluid" else Media()
         shown_image = light(frames["board" if board else "white"], frames.get("dark"), None)
-        write_picture(views, views_figure(calibration, camera, medium, shown_image), overwrite)
+        pages.write_picture(views, views_figure(calibration, camera, medium, shown_image), overwrite)
     return calibration.summary()
 
 

@@ -15,12 +15,10 @@ from lfpiv_cli.calibration.lens_light import LensImages, dark_level
 from lfpiv_cli.calibration.model import Calibration
 from lfpiv_cli.console import CONSOLE, Console
 from lfpiv_cli.errors import ConfigError, InputError
-from lfpiv_cli.files.atomic import ensure_writable
-from lfpiv_cli.files.calibration_file import open_calibration
+from lfpiv_cli.files import atomic, calibration_file, pages
 from lfpiv_cli.files.config import Config, load_rig
 from lfpiv_cli.files.images import read_reference, read_single
 from lfpiv_cli.files.inputs import given
-from lfpiv_cli.files.pages import ensure_drawing, write_picture
 from lfpiv_cli.notice import written
 from lfpiv_cli.particles.counting import Seeded, tracers_in_image
 from lfpiv_cli.particles.noise import read_noise
@@ -322,8 +320,8 @@ def check(
     """Return the verdict on a rig and on images, the lines that it comes from, and their figures."""
     inputs = given(config=config, white=options.white, dark=options.dark, calibration=options.calibration)
     if options.picture is not None:
-        ensure_writable(options.picture, overwrite, [*inputs.values(), *images])
-        ensure_drawing()
+        atomic.ensure_writable(options.picture, overwrite, [*inputs.values(), *images])
+        pages.ensure_drawing()
     settings = load_rig(config)
     shape = settings.image_shape()
     pictures = Pictures(
@@ -331,7 +329,7 @@ def check(
         None if options.white is None else read_reference(options.white, shape),
         None if options.dark is None else read_reference(options.dark, shape),
     )
-    found = None if options.calibration is None else open_calibration(options.calibration)
+    found = None if options.calibration is None else calibration_file.open_calibration(options.calibration)
     of_white, lines = lattice_of(settings, pictures)
     found = found or of_white
     bench = of_rigs.bench_of(settings, found, options.velocity_m_s)
@@ -343,5 +341,5 @@ def check(
     if options.picture is not None:
         from lfpiv_cli.pictures.calibration import planning_figure
 
-        write_picture(options.picture, planning_figure(of_rigs.by_depth(bench), bench.bounds_mm), overwrite)
+        pages.write_picture(options.picture, planning_figure(of_rigs.by_depth(bench), bench.bounds_mm), overwrite)
     return {"verdicts": [asdict(line) for line in lines], **figures, "verdict": worst(lines)}

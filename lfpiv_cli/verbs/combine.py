@@ -10,9 +10,7 @@ import numpy as np
 
 from lfpiv_cli.console import CONSOLE, Console
 from lfpiv_cli.errors import InputError
-from lfpiv_cli.files import vtkhdf
-from lfpiv_cli.files.atomic import ensure_writable
-from lfpiv_cli.files.batch import is_kept
+from lfpiv_cli.files import atomic, batch, vtkhdf
 from lfpiv_cli.files.provenance import OF_COORDINATES, ensure_agreement, record
 from lfpiv_cli.flow.combining import Combined
 from lfpiv_cli.flow.combining import combine as weighted
@@ -54,14 +52,14 @@ def combine_vectors(
 ) -> dict[str, Any]:
     """Weight the vectors of two files by their uncertainties; with `resume`, keep what was made from the same."""
     inputs = {"vectors_a": vectors_a, "vectors_b": vectors_b}
-    ensure_writable(output, overwrite or resume, inputs.values())
+    atomic.ensure_writable(output, overwrite or resume, inputs.values())
     headers = [vtkhdf.read_header(path) for path in inputs.values()]
     if headers[0].reference != headers[1].reference:
         raise InputError(f"{vectors_b}: its coordinates have another origin than those of {vectors_a}")
     ensure_agreement([header.provenance for header in headers], [str(path) for path in inputs.values()], OF_COORDINATES)
     made = record("combine", headers[0].provenance.get("config"), inputs)
     if resume:
-        if is_kept([output], made, inputs.values(), overwrite):
+        if batch.is_kept([output], made, inputs.values(), overwrite):
             return {"vectors": vtkhdf.open_vectors(output).flag.size}
         overwrite = True
     found = weighted(*(vtkhdf.open_vectors(path) for path in inputs.values()))

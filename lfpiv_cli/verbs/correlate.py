@@ -15,11 +15,9 @@ from numpy.typing import NDArray
 
 from lfpiv_cli.console import CONSOLE, Console, Frames
 from lfpiv_cli.errors import InputError, LfpivError, UsageError
-from lfpiv_cli.files import provenance, vtkhdf
-from lfpiv_cli.files.atomic import ensure_writable, folder_of
+from lfpiv_cli.files import atomic, hdf5, provenance, vtkhdf
 from lfpiv_cli.files.batch import Target, output_paths, results_seen
 from lfpiv_cli.files.config import Config, carried_config, load_rig
-from lfpiv_cli.files.hdf5 import ensure_opens, fault_of
 from lfpiv_cli.files.inputs import ensure_room, given
 from lfpiv_cli.files.pairing import Pairs
 from lfpiv_cli.files.sections_work import CorrelationKeys
@@ -217,7 +215,7 @@ def _as_they_come(
     coming = watched(folders, "results", options, options.idle_s, console)
     pairs = coming_pairs(coming, results_seen, options, console, left_out)
     groups = ([path for pair in group for path in pair] for group in pairs)
-    with folder_of(output / folders[0].name):
+    with atomic.folder_of(output / folders[0].name):
         return work_as_they_come(of_pairs, groups, options, console, left_out)
 
 
@@ -258,7 +256,7 @@ class Correlation(PairBatch[Outcome, CorrelateOptions]):
         fault: InputError | None = None
         for path in () if self._gone else files:
             try:
-                ensure_opens(path)
+                hdf5.ensure_opens(path)
             except InputError as error:
                 if not options.keep_going:
                     raise
@@ -271,7 +269,7 @@ class Correlation(PairBatch[Outcome, CorrelateOptions]):
 
     def fault(self, number: int) -> str | None:
         """Return why a volume of a field cannot be opened."""
-        return fault_of(path for pair in self._groups[number] for path in pair)
+        return hdf5.fault_of(path for pair in self._groups[number] for path in pair)
 
     def expected(self) -> Expected:
         """Return the bytes of a field's arrays, and what a correlation holds."""
@@ -282,7 +280,7 @@ class Correlation(PairBatch[Outcome, CorrelateOptions]):
     def begin(self, numbers: Sequence[int], _console: Console) -> float:
         """Refuse a mean that could not be written, and fields too large for the memory."""
         if self._options.mean is not None:
-            ensure_writable(self._options.mean, self.overwrite or self._options.resume)
+            atomic.ensure_writable(self._options.mean, self.overwrite or self._options.resume)
         if numbers and not self._gone:
             try:
                 held = self.expected().memory_bytes or 0.0

@@ -9,10 +9,8 @@ from typing import Any
 
 from lfpiv_cli.console import CONSOLE, Console
 from lfpiv_cli.errors import InputError, UsageError
-from lfpiv_cli.files.atomic import ensure_writable, written_atomically
+from lfpiv_cli.files import atomic, export_vtk, provenance
 from lfpiv_cli.files.export_formats import FORMATS, Content, ensure_fits, read_content, write_netcdf
-from lfpiv_cli.files.export_vtk import write_series
-from lfpiv_cli.files.provenance import record
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.names import ExportFormat
 
@@ -54,12 +52,12 @@ def export(
         raise UsageError(f"{len(files)} files go into one, whose name -o has to say")
     to = options.to
     target = output or files[0].with_name(files[0].stem + FORMATS[to].ending)
-    ensure_writable(target, overwrite, files)
+    atomic.ensure_writable(target, overwrite, files)
     first = _read(files[0], options.plane)
     ensure_fits(files[0], first.format_name, to, len(files))
     inputs = {"file": files[0]} if len(files) == 1 else {f"file_{k:04d}": path for k, path in enumerate(files)}
     words = f"export {to}" if options.plane is None else f"export {to} plane {options.plane}"
-    made = record(words, None, inputs)
+    made = provenance.record(words, None, inputs)
     first = replace(first, provenance=made)
 
     def read(number: int) -> Content:
@@ -80,13 +78,13 @@ def export(
     times = None if options.step_s is None else [options.step_s * number for number in range(len(files))]
     write = FORMATS[to].write
     if to == "vtkhdf-series":
-        write_series(target, first, read, len(files), times, made, overwrite=overwrite)
+        export_vtk.write_series(target, first, read, len(files), times, made, overwrite=overwrite)
     elif write is None:
         contents = [read(number) for number in range(len(files))]
-        with written_atomically(target, overwrite=overwrite) as path:
+        with atomic.written_atomically(target, overwrite=overwrite) as path:
             write_netcdf(path, contents, times)
     else:
-        with written_atomically(target, overwrite=overwrite) as path:
+        with atomic.written_atomically(target, overwrite=overwrite) as path:
             write(path, first)
     return {
         "output": target.name,

@@ -17,10 +17,8 @@ from lfpiv_cli.fields.fit import SEED, Field, fit_field
 from lfpiv_cli.fields.spline_field import SplineField
 from lfpiv_cli.fields.stencils import Lattice
 from lfpiv_cli.fields.structure import Samples
-from lfpiv_cli.files import vtkhdf
-from lfpiv_cli.files.atomic import ensure_writable, write_text
+from lfpiv_cli.files import atomic, hdf5, vtkhdf
 from lfpiv_cli.files.config import Config
-from lfpiv_cli.files.hdf5 import format_of
 from lfpiv_cli.files.inputs import content_of
 from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, TRAJECTORIES_FORMAT, Points, open_tracks, read_points
 from lfpiv_cli.files.provenance import OF_COORDINATES, record, with_warnings
@@ -226,9 +224,9 @@ def fit_flow(
 ) -> dict[str, Any]:
     """Fit a field to files of tracks of pairs and of vectors, and write it on the grid of the correlation windows."""
     places = output.with_name(f"{output.stem}_at.csv")
-    ensure_writable(output, overwrite, paths)
+    atomic.ensure_writable(output, overwrite, paths)
     if options.at is not None:
-        ensure_writable(places, overwrite, [*paths, options.at])
+        atomic.ensure_writable(places, overwrite, [*paths, options.at])
     points = None if options.at is None else read_places(options.at)
     headers, names = [vtkhdf.read_header(path) for path in paths], [str(path) for path in paths]
     for header, name in zip(headers, names, strict=True):
@@ -239,7 +237,7 @@ def fit_flow(
     pressed = _pressure(paths, settings, options)
     parts = [
         fields.samples_of_vectors(vtkhdf.open_vectors(path), str(path))
-        if format_of(path) == vtkhdf.VECTORS_FORMAT
+        if hdf5.format_of(path) == vtkhdf.VECTORS_FORMAT
         else fields.samples_of_tracks(open_tracks(path), options.frame)
         for path in paths
     ]
@@ -262,7 +260,7 @@ def fit_flow(
         extra |= {"pressure": (pressed.pressure_pa, "Pa"), "pressure_sigma": (pressed.pressure_sigma_pa, "Pa")}
     vtkhdf.write_vectors(output, vectors, headers[0].reference, provenance=made, overwrite=overwrite, extra=extra)
     if points is not None:
-        write_text(places, _table(points, found), overwrite)
+        atomic.write_text(places, _table(points, found), overwrite)
     figures = {} if pressed is None else pressed.figures
     if options.derived:
         density, viscosity = settings.media.fluid_density_kg_m3, settings.media.fluid_viscosity_pa_s
@@ -275,7 +273,7 @@ def _pressure(paths: Sequence[Path], settings: Config, options: FieldOptions) ->
     """Return the pressure of a sequence, if it is asked for."""
     if not options.pressure:
         return None
-    if len(paths) != 1 or format_of(paths[0]) != TRAJECTORIES_FORMAT:
+    if len(paths) != 1 or hdf5.format_of(paths[0]) != TRAJECTORIES_FORMAT:
         raise UsageError("--pressure is for the tracks of one sequence, from follow or track")
     particles = [read_points(path, PARTICLES_FORMAT) for path in options.pressure]
     try:

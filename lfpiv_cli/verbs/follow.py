@@ -17,15 +17,12 @@ from typing import Any
 
 from lfpiv_cli.console import CONSOLE, Console, Frames
 from lfpiv_cli.errors import InputError, UsageError
+from lfpiv_cli.files import atomic, export_vtk, pairing, shares
 from lfpiv_cli.files import images as image_files
-from lfpiv_cli.files.atomic import ensure_writable
 from lfpiv_cli.files.batch import VTKHDF_SUFFIX, Frame, Target, frames_of, images_seen, output_paths, pending
 from lfpiv_cli.files.config import Config, carried_config
-from lfpiv_cli.files.export_vtk import write_playback
-from lfpiv_cli.files.pairing import in_order
 from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, Points, no_points, read_points, write_points
 from lfpiv_cli.files.provenance import even_step_s, record, sha256, with_warnings
-from lfpiv_cli.files.shares import awaited
 from lfpiv_cli.files.weights_file import WeightsFile
 from lfpiv_cli.grid import Reference
 from lfpiv_cli.notice import Notice
@@ -95,7 +92,7 @@ class Way(Batch[None]):
     def ensure_residuals(self, numbers: Sequence[int]) -> None:
         """Refuse residual images that could not be written."""
         for number in numbers if self.residuals else ():
-            ensure_writable(of_frames.residual_path(self.targets[number].path), self._replace, self.inputs)
+            atomic.ensure_writable(of_frames.residual_path(self.targets[number].path), self._replace, self.inputs)
 
     def begin(self, numbers: Sequence[int], console: Console) -> float:
         """Return the steps of a frame: only the first two are searched from nothing."""
@@ -124,7 +121,7 @@ class Way(Batch[None]):
         if number not in self.order or number in self.failed:
             return no_points(PARTICLES_FORMAT, self.reference)
         if not path.exists():
-            with awaited(path):  # another worker makes it now
+            with shares.awaited(path):  # another worker makes it now
                 pass
         return read_points(path, PARTICLES_FORMAT)
 
@@ -151,8 +148,8 @@ def follow_particles(
     frames, replacing = frames_of(images, options.keep_going), overwrite or options.resume
     ensure_sequence(len(frames), options.shortest)
     if options.failures is not None:
-        ensure_writable(options.failures, replacing, images)
-    order, notices = in_order(images_seen(frames))
+        atomic.ensure_writable(options.failures, replacing, images)
+    order, notices = pairing.in_order(images_seen(frames))
     frames = [frames[number] for number in order]
     console.warn(notices)
     content = open_weights_that_fit(weights)
@@ -175,7 +172,7 @@ def follow_particles(
     if options.dry_run:
         return dry_run(last, options, console)
     for path in results:
-        ensure_writable(path, replacing, last.inputs)
+        atomic.ensure_writable(path, replacing, last.inputs)
     if last is not ways[0]:
         # What is made the second time can be written, which is to be known before the first.
         there_again = pending([last.targets[k] for k in there], last.inputs, overwrite, options.resume, dry=True)
@@ -269,7 +266,7 @@ def _write_tracks(
         console.warn(notices)
         reported = result.points.with_record(with_warnings(provenance, notices))
         write_points(output / TRACKS, result.format_name, reported, overwrite=overwrite)
-        write_playback(output / PLAYBACK, reported, len(frames), tracking.dt_s, overwrite=overwrite)
+        export_vtk.write_playback(output / PLAYBACK, reported, len(frames), tracking.dt_s, overwrite=overwrite)
     return {"particles_fewest": min(counts)} | {k: v for k, v in result.summary.items() if k != "frames"}
 
 

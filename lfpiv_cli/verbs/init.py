@@ -10,10 +10,8 @@ from typing import Any
 
 from lfpiv_cli.console import CONSOLE, Console
 from lfpiv_cli.errors import UsageError
-from lfpiv_cli.files import calibration_file
-from lfpiv_cli.files.atomic import ensure_writable, write_text
+from lfpiv_cli.files import atomic, calibration_file, hdf5
 from lfpiv_cli.files.config import Config, carried_config
-from lfpiv_cli.files.hdf5 import read_tree
 from lfpiv_cli.files.rig_numbers import LATTICES, TABLE2, RigNumbers, rig_text, schema, tree_of
 from lfpiv_cli.names import KnownCamera
 from lfpiv_cli.verbs.planning import bench_of, windows_line
@@ -40,13 +38,13 @@ class InitOptions:
 def init(output: Path, options: InitOptions, *, overwrite: bool = False, console: Console = CONSOLE) -> dict[str, Any]:
     """Write a configuration, once it has been found to be without contradictions."""
     inputs = [] if options.calibration is None else [options.calibration]
-    ensure_writable(output, overwrite, inputs)
+    atomic.ensure_writable(output, overwrite, inputs)
     given = [each for each in (options.numbers, options.camera, options.calibration) if each is not None]
     if len(given) != 1:
         raise UsageError(f"a configuration is from numbers, a camera or a calibration; {len(given)} of them were given")
     tree: Mapping[str, Any]
     if options.calibration is not None:
-        _, made = read_tree(options.calibration, calibration_file.FORMAT, calibration_file.VERSION)
+        _, made = hdf5.read_tree(options.calibration, calibration_file.FORMAT, calibration_file.VERSION)
         sections = carried_config(made, options.calibration).sections
         title = f"The rig that {options.calibration.name} was made with, by `lfpiv init`."
         tree = sections.model_dump(mode="json", exclude_defaults=True)
@@ -57,7 +55,7 @@ def init(output: Path, options: InitOptions, *, overwrite: bool = False, console
         title, tree = "A rig, by `lfpiv init`.", tree_of(options.numbers)
     settings = Config.from_resolved(tree, "the numbers given")
     beside = SCHEMA_NAME if (output.parent / SCHEMA_NAME).exists() else None
-    write_text(output, rig_text(tree, title, beside), overwrite)
+    atomic.write_text(output, rig_text(tree, title, beside), overwrite)
     if options.numbers is not None and (windows := windows_line(bench_of(settings, None))).verdict != "good":
         console.say(f"windows: {windows.reason}")
     console.say(f"next: lfpiv check {output}")
@@ -66,7 +64,7 @@ def init(output: Path, options: InitOptions, *, overwrite: bool = False, console
 
 def write_schema(output: Path, *, overwrite: bool = False) -> dict[str, Any]:
     """Write the JSON schema of configurations."""
-    ensure_writable(output, overwrite)
+    atomic.ensure_writable(output, overwrite)
     content = schema()
-    write_text(output, json.dumps(content, indent=2) + "\n", overwrite)
+    atomic.write_text(output, json.dumps(content, indent=2) + "\n", overwrite)
     return {"schema": output.name, "sections": list(content["properties"])}

@@ -15,12 +15,10 @@ from typing import Any, Generic, TypeVar
 from lfpiv_cli.console import Console, Frames
 from lfpiv_cli.errors import InputError, UsageError
 from lfpiv_cli.files import images as image_files
-from lfpiv_cli.files import vtkhdf
+from lfpiv_cli.files import listing, shares, vtkhdf
 from lfpiv_cli.files.batch import State, Target, pending, results_seen, state_or_none
-from lfpiv_cli.files.listing import as_they_come, files_in
 from lfpiv_cli.files.pairing import Pairs, Seen, contradiction, in_order, pair_frames, pairs_listed
 from lfpiv_cli.files.provenance import Gone, carried_record, sha256, without_warnings
-from lfpiv_cli.files.shares import awaited
 from lfpiv_cli.names import InputKind, Pairing
 from lfpiv_cli.notice import Notice
 from lfpiv_cli.verbs import batches
@@ -187,9 +185,9 @@ def watched(
         def listed() -> list[Path]:
             if not deadline.leaves_time():
                 raise deadline.error(count, count, "frame")
-            return [path for folder in folders for path in files_in(folder, kind)]
+            return [path for folder in folders for path in listing.files_in(folder, kind)]
 
-        for group in as_they_come(listed, read, idle_s, passed_over):
+        for group in listing.as_they_come(listed, read, idle_s, passed_over):
             count += len(group)
             yield group
         if count == 0:
@@ -328,7 +326,7 @@ class PairByPair(Batch[Made]):
             target = self._found.targets[k]
             stamp = batches.stamp_of(target.path)
             if stamp is None or self._whole.get(k) != stamp:
-                with awaited(target.path):
+                with shares.awaited(target.path):
                     if state_or_none(target) is not State.COMPLETE:
                         self._found.make(k, work)
                 self._whole[k] = batches.stamp_of(target.path)

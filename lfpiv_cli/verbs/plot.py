@@ -15,15 +15,9 @@ from numpy.typing import NDArray
 from lfpiv_cli.calibration.model import Calibration
 from lfpiv_cli.console import CONSOLE, Console
 from lfpiv_cli.errors import ConfigError, InputError, UsageError
-from lfpiv_cli.files import calibration_file, particle_file, vtkhdf, weights_file
-from lfpiv_cli.files.atomic import ensure_writable
-from lfpiv_cli.files.calibration_file import open_calibration
+from lfpiv_cli.files import atomic, calibration_file, hdf5, images, inputs, pages, particle_file, vtkhdf, weights_file
 from lfpiv_cli.files.config import carried_config
 from lfpiv_cli.files.figures import FIGURES, describe, is_recording, recording_figures
-from lfpiv_cli.files.hdf5 import format_of
-from lfpiv_cli.files.images import read_single
-from lfpiv_cli.files.inputs import given
-from lfpiv_cli.files.pages import ensure_drawing, write_pdf, write_picture
 from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, TRACKS_FORMAT, TRAJECTORIES_FORMAT, Points
 from lfpiv_cli.files.weights_file import FORMAT, WeightsFile, open_weights
 from lfpiv_cli.flow.field import VectorField
@@ -135,10 +129,10 @@ def _of_particles_in(path: Path, raw: Path | None) -> Figures:
         config = carried_config(points.provenance, path)
         focal_point = points.reference.points_to_focal_point(points.position_mm)
         places = of_points.places_px(focal_point, config.camera_model(), config.media_model(), config.scene_space())
-        image, z_mm = read_single(raw, config.image_shape()).astype(np.float64), points.position_mm[:, 2]
+        image, z_mm = images.read_single(raw, config.image_shape()).astype(np.float64), points.position_mm[:, 2]
         on_images["image"] = partial(of_points.image_figure, image, places, z_mm)
     if left.is_file():
-        on_images["residual"] = partial(of_points.residual_figure, read_single(left).astype(np.float64))
+        on_images["residual"] = partial(of_points.residual_figure, images.read_single(left).astype(np.float64))
     return {"places": figures.pop("places")} | on_images | figures
 
 
@@ -205,10 +199,10 @@ def of_calibration(calibration: Calibration) -> Figures:
 
 
 def _of_calibration_in(path: Path, white: Path | None) -> Figures:
-    calibration = open_calibration(path)
+    calibration = calibration_file.open_calibration(path)
     figures = of_calibration(calibration)
     if white is not None:
-        image = read_single(white, calibration.image_shape)
+        image = images.read_single(white, calibration.image_shape)
         figures["lattice"] = partial(pictures.calibration_figure, calibration, image)
     return figures
 
@@ -283,7 +277,7 @@ def figures_of(path: Path, raw: Path | None = None) -> dict[str, Drawn]:
     InputError : the file is missing, broken or of no format that has figures, or the image does not fit it
     UsageError : there is no figure on an image in it
     """
-    of_format = format_of(path)
+    of_format = hdf5.format_of(path)
     if of_format not in READERS and of_format not in ON_IMAGES:
         raise InputError(f"{path}: {of_format} has no figures, only {', '.join(sorted({*READERS, *ON_IMAGES}))}")
     if raw is not None and of_format not in ON_IMAGES:
@@ -313,7 +307,7 @@ def plot(
     """
     if output.suffix not in SUFFIXES:
         raise UsageError(f"{output}: pictures are written as {' or '.join(SUFFIXES)}")
-    ensure_drawing()
+    pages.ensure_drawing()
     figures = figures_of(file, options.raw)
     unknown = [name for name in options.only if name not in figures]
     if unknown:
@@ -324,14 +318,14 @@ def plot(
     if output.suffix != ".pdf" and len(chosen) > 1:
         targets = {name: output.with_name(f"{output.stem}_{name}{output.suffix}") for name in chosen}
     for target in targets.values():
-        ensure_writable(target, overwrite, given(file=file, raw=options.raw).values())
+        atomic.ensure_writable(target, overwrite, inputs.given(file=file, raw=options.raw).values())
     with console.progress(len(chosen), "figures") as advance:
         drawn = _drawn(chosen, advance)
         if output.suffix == ".pdf":
-            write_pdf(output, drawn, overwrite)
+            pages.write_pdf(output, drawn, overwrite)
         else:
             for target, figure in zip(targets.values(), drawn, strict=True):
-                write_picture(target, figure, overwrite)
+                pages.write_picture(target, figure, overwrite)
     return {"figures": list(chosen), "files": [str(target) for target in dict.fromkeys(targets.values())]}
 
 
@@ -362,8 +356,8 @@ def info(
         if voxel is not None:
             raise UsageError("--voxel needs --picture")
         return _told(file)
-    ensure_writable(picture, overwrite, [file])
-    ensure_drawing()
+    atomic.ensure_writable(picture, overwrite, [file])
+    pages.ensure_drawing()
     found = _told(file)
     if found["format"] != FORMAT:
         others = "" if is_recording(file) else f"; for the figures of {found['format']}: lfpiv plot {file}"
@@ -373,7 +367,7 @@ def info(
     ix, iy, iz = voxel or (nx // 2, ny // 2, nz // 2)
     if not (0 <= ix < nx and 0 <= iy < ny and 0 <= iz < nz):
         raise UsageError(f"--voxel {ix} {iy} {iz}: there are {nx} x {ny} x {nz} voxels, counted from 0")
-    write_picture(picture, column_of(content, (ix, iy, iz)), overwrite)
+    pages.write_picture(picture, column_of(content, (ix, iy, iz)), overwrite)
     return found
 
 

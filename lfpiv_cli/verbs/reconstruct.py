@@ -14,12 +14,9 @@ from numpy.typing import NDArray
 
 from lfpiv_cli.console import CONSOLE, Console, Frames
 from lfpiv_cli.errors import InputError, UsageError
+from lfpiv_cli.files import atomic, config, hdf5, vtkhdf
 from lfpiv_cli.files import images as image_files
-from lfpiv_cli.files import vtkhdf
-from lfpiv_cli.files.atomic import ensure_writable, folder_of
 from lfpiv_cli.files.batch import Target, frames_of, images_seen, output_paths
-from lfpiv_cli.files.config import carried_config
-from lfpiv_cli.files.hdf5 import unpacked_bytes
 from lfpiv_cli.files.inputs import ensure_room
 from lfpiv_cli.files.pairing import Pairs
 from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, write_points
@@ -82,7 +79,7 @@ def reconstruct(
     InputError
         An image has another shape than what the weights were made for, or does not fit into memory.
     """
-    chosen = carried_config(weights.provenance, "the weights").overridden("reconstruction", **settings)
+    chosen = config.carried_config(weights.provenance, "the weights").overridden("reconstruction", **settings)
     if chosen.reconstruction.solver == "particles":
         raise UsageError("reconstruct: the solver particles makes no volume; find_particles finds them")
     bench = of_frames.bench_of(
@@ -167,13 +164,13 @@ def reconstruct_files(
 ) -> dict[str, Any]:
     """Reconstruct the volume behind each image, or find its particles."""
     if options.watch:
-        settings = carried_config(read_weights_record(weights), weights).overridden_by("reconstruction", options)
+        settings = config.carried_config(read_weights_record(weights), weights).overridden_by("reconstruction", options)
         if settings.reconstruction.solver == "particles":
             why = "the tracers' size, which --solver particles needs, is measured first"
             raise UsageError(f"--watch: {why}; run --watch does so")
         options.ensure_one_by_one()
         groups = watched(images, "images", options, options.idle_s, console)
-        with folder_of(output / weights.name):
+        with atomic.folder_of(output / weights.name):
             batch, worked = work_as_they_come(
                 lambda group: Reconstruction(weights, group, output, options, overwrite), groups, options, console
             )
@@ -241,7 +238,7 @@ class Reconstruction(Batch[Outcome]):
         self._paths = output_paths(self.output, self.names)
         self._gone = {} if to_come is None else {weights: to_come}
         carried = read_weights_record(weights) if to_come is None else to_come.record
-        self._settings = carried_config(carried, weights).overridden_by("reconstruction", options)
+        self._settings = config.carried_config(carried, weights).overridden_by("reconstruction", options)
         solver = self._settings.reconstruction.solver
         self._as_particles = solver == "particles"
         if self._beside is not None and not self._as_particles:
@@ -265,7 +262,7 @@ class Reconstruction(Batch[Outcome]):
         path = self._common["weights"]
         weights = self._prepared.weights(path).weights
         voxels, pixels = math.prod(weights.padded.shape), math.prod(weights.image_shape)
-        rows = columns_bytes(voxels) if weights.on_demand else unpacked_bytes(path)
+        rows = columns_bytes(voxels) if weights.on_demand else hdf5.unpacked_bytes(path)
         return Expected(FLOAT_BYTES * math.prod(weights.shape), held_bytes(voxels, pixels) + rows)
 
     def begin(self, numbers: Sequence[int], console: Console) -> float:
@@ -273,7 +270,7 @@ class Reconstruction(Batch[Outcome]):
         options, settings, frames = self.options, self._settings, self._frames
         if self._as_particles and options.residual:
             for number in numbers:
-                ensure_writable(of_frames.residual_path(self._paths[number]), self._replace)
+                atomic.ensure_writable(of_frames.residual_path(self._paths[number]), self._replace)
             coming = set(numbers)
             complete = [path for number, path in enumerate(self._paths) if number not in coming and path.exists()]
             if without := sum(not of_frames.residual_path(path).exists() for path in complete):

@@ -12,14 +12,10 @@ import numpy as np
 from lfpiv_cli.calibration.model import Calibration
 from lfpiv_cli.console import CONSOLE, Console
 from lfpiv_cli.errors import ConfigError
+from lfpiv_cli.files import atomic, batch, calibration_file, pages, provenance
 from lfpiv_cli.files import images as image_files
-from lfpiv_cli.files.atomic import ensure_apart, ensure_writable
-from lfpiv_cli.files.batch import frames_of
-from lfpiv_cli.files.calibration_file import open_calibration, write_calibration
 from lfpiv_cli.files.config import Config, load_rig
 from lfpiv_cli.files.inputs import given
-from lfpiv_cli.files.pages import ensure_drawing, write_picture
-from lfpiv_cli.files.provenance import record
 from lfpiv_cli.notice import Notice
 from lfpiv_cli.optics.curved_space import CurvedSpace
 from lfpiv_cli.optics.tracing import ObjectSpace
@@ -61,18 +57,18 @@ def refine_calibration(
     named = {"image" if k == 0 else f"image_{k + 1}": path for k, path in enumerate(images)}
     inputs = given(config=config, calibration=calibration, dark=dark, background=background) | named
     outputs = [path for path in (output, picture) if path is not None]
-    ensure_apart(outputs, inputs.values())
+    atomic.ensure_apart(outputs, inputs.values())
     for target in outputs:
-        ensure_writable(target, overwrite)
+        atomic.ensure_writable(target, overwrite)
     if picture:
-        ensure_drawing()
-    before = open_calibration(calibration)
+        pages.ensure_drawing()
+    before = calibration_file.open_calibration(calibration)
     reported = load_rig(config)
     settings = reported.with_scene_of(before)
     scene = settings.scene_space()
     if settings.channel is None and scene is None:
         raise ConfigError(f"{config}: channel: is missing; the walls are known by the channel's width, or by a scene")
-    frames, shape = frames_of(images), settings.image_shape()
+    frames, shape = batch.frames_of(images), settings.image_shape()
     dark_image, empty = (image_files.read_reference(path, shape) if path else None for path in (dark, background))
     lit = [light(image_files.read_image(frame.path, frame.page, shape), dark_image, empty) for frame in frames]
     found: Refinement | SceneRefinement
@@ -83,13 +79,13 @@ def refine_calibration(
         found = _scene(settings, scene, lit, before, console)
         mended = found.applied(before, reported.scene_fingerprint())
     if output:
-        made_by = record("refine-calibration", reported.resolved(), inputs)
-        write_calibration(output, mended, made_by, overwrite)
+        made_by = provenance.record("refine-calibration", reported.resolved(), inputs)
+        calibration_file.write_calibration(output, mended, made_by, overwrite)
     if picture:
         from lfpiv_cli.pictures.calibration import round_wall_figure, walls_figure
 
         drawn = walls_figure(found) if isinstance(found, Refinement) else round_wall_figure(found)
-        write_picture(picture, drawn, overwrite)
+        pages.write_picture(picture, drawn, overwrite)
     return found.summary()
 
 

@@ -23,23 +23,16 @@ from typing import Any, cast
 
 from lfpiv_cli.console import CONSOLE, Console
 from lfpiv_cli.errors import ConfigError, InputError, LfpivError, OutputExistsError, PartialError, UsageError
+from lfpiv_cli.files import atomic, calibration_file, inputs, pages
 from lfpiv_cli.files import images as image_files
-from lfpiv_cli.files.atomic import ensure_writable, write_text
 from lfpiv_cli.files.batch import Frame, frames_of, images_seen, output_paths, pending
-from lfpiv_cli.files.calibration_file import open_calibration
 from lfpiv_cli.files.config import Config, load_rig
-from lfpiv_cli.files.inputs import ensure_regular_file, split_part
-from lfpiv_cli.files.pages import ensure_drawing, ensure_pages
 from lfpiv_cli.files.pairing import Pairs
 from lfpiv_cli.files.provenance import Gone, carried_record, sha256, without_warnings
 from lfpiv_cli.names import FlowMethod
 from lfpiv_cli.notice import written
-from lfpiv_cli.verbs import build_weights, calibrate, particles, run_steps
+from lfpiv_cli.verbs import build_weights, calibrate, checks, correlate, particles, run_steps
 from lfpiv_cli.verbs.batches import ALL, MB, Expected, Failure, Worked, dry_run, estimate
-from lfpiv_cli.verbs.build_weights import plan_of
-from lfpiv_cli.verbs.calibrate import ensure_pictures
-from lfpiv_cli.verbs.checks import figures_of
-from lfpiv_cli.verbs.correlate import field_bytes
 from lfpiv_cli.verbs.follow import SEQUENCE_IS_WHOLE, TRACKS, follow_particles
 from lfpiv_cli.verbs.following import SHORTEST, ensure_sequence
 from lfpiv_cli.verbs.frames import Bench, Read, mask_of, other_frames, read_frame, reader
@@ -100,7 +93,7 @@ def run(
 def take_all(chain: Chain) -> dict[str, Any]:
     """Take all steps; return what is told of them (PartialError: something failed)."""
     steps, options, output = chain.steps, chain.options, chain.steps.output
-    ensure_writable(output / run_steps.RECORD, overwrite=True)
+    atomic.ensure_writable(output / run_steps.RECORD, overwrite=True)
     weights = chain.weights()
     if not chain.share:
         return steps.summary()
@@ -108,7 +101,7 @@ def take_all(chain: Chain) -> dict[str, Any]:
     steps.console.say(f"by {' and '.join(choice.methods)}: {choice.reason}")
     steps.reported.update(choice.reported())
     fields = measured(chain, choice, weights)
-    figures = figures_of({method: list(paths.values()) for method, paths in fields.items()})
+    figures = checks.figures_of({method: list(paths.values()) for method, paths in fields.items()})
     steps.reported["figures"] = figures
     reported = choice.reported() | figures
     if options.report and options.shard == ALL:
@@ -208,16 +201,16 @@ def ensure_inputs(settings: Config, options: RunOptions) -> None:
         raise ConfigError(f"{settings.source}: reconstruction.solver: is particles; volumes need another one")
     if settings.weights.method == "dlfc" and (options.follow or by_particles):
         raise ConfigError(f"{settings.source}: weights.method: is dlfc, but particles are fitted with traced rays")
-    ensure_drawing()
+    pages.ensure_drawing()
     if options.report:
-        ensure_pages()
-    ensure_pictures(len(options.white), len(options.board), len(options.depth_mm))
+        pages.ensure_pages()
+    calibrate.ensure_pictures(len(options.white), len(options.board), len(options.depth_mm))
     for path in (*options.white, *options.board):
-        ensure_regular_file(split_part(path)[0])
+        inputs.ensure_regular_file(inputs.split_part(path)[0])
     for path in filter(None, (options.dark, options.level.path, options.mask_file)):
         image_files.read_reference(path, settings.image_shape())
     if options.failures is not None:
-        ensure_writable(options.failures, overwrite=True)
+        atomic.ensure_writable(options.failures, overwrite=True)
 
 
 def _ensure_possible(settings: Config, options: RunOptions) -> tuple[list[Frame], Pairs]:
@@ -343,7 +336,7 @@ def planned(chain: Chain) -> dict[str, Any]:
         if options.keep == "all" or in_time:
             reported[method] = dry_run(found, chain.batch_options(shared=False), console)
         if not in_time:
-            size = field_bytes(settings, settings.grid()) if method == "volumes" else None
+            size = correlate.field_bytes(settings, settings.grid()) if method == "volumes" else None
             batch = chain.in_pairs(method, found, size)
             reported[run_steps.RESULTS[method]] = dry_run(batch, chain.batch_options(shared=True), console)
     return counts | {"method": " and ".join(methods)} | _together(reported)
@@ -398,11 +391,13 @@ def _from_nothing(chain: Chain) -> dict[str, Any]:
     cost: Cost | None = None
     # What the weights will cost is not always known without a calibration.
     with contextlib.suppress(LfpivError):
-        plan = plan_of(settings, open_calibration(calibration) if calibration.exists() else None)
+        plan = build_weights.plan_of(
+            settings, calibration_file.open_calibration(calibration) if calibration.exists() else None
+        )
         cost = cost_of(settings, plan.camera, plan.source, plan.grid.padded(plan.padding))
     held = None if cost is None else cost.image_bytes
     sizes = {
-        "volumes": (FLOAT_BYTES * math.prod(grid.shape_xyz), field_bytes(settings, grid)),
+        "volumes": (FLOAT_BYTES * math.prod(grid.shape_xyz), correlate.field_bytes(settings, grid)),
         "particles": (None, None),
     }
     reported = {}
@@ -476,7 +471,7 @@ def warm_up(*, console: Console = CONSOLE) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as name, console.progress(WARM_UP_STEPS, "warm-up") as advance:
         folder = Path(name)
         config = folder / "rig.yaml"
-        write_text(config, RIG, overwrite=False)
+        atomic.write_text(config, RIG, overwrite=False)
         for simulate in (simulate_white, simulate_board, simulate_particles):
             simulate(config, folder, console=quiet)
         advance(1)

@@ -11,13 +11,8 @@ import numpy as np
 
 from lfpiv_cli.console import CONSOLE, Console, Frames
 from lfpiv_cli.errors import InputError, UsageError
-from lfpiv_cli.files import vtkhdf
-from lfpiv_cli.files.atomic import ensure_writable
+from lfpiv_cli.files import atomic, config, hdf5, inputs, listing, vtkhdf
 from lfpiv_cli.files.batch import Target, is_kept
-from lfpiv_cli.files.config import carried_config
-from lfpiv_cli.files.hdf5 import format_of, unpacked_bytes
-from lfpiv_cli.files.inputs import ensure_room
-from lfpiv_cli.files.listing import natural
 from lfpiv_cli.files.particle_file import TRACKS_FORMAT, TRAJECTORIES_FORMAT, open_tracks
 from lfpiv_cli.files.provenance import OF_COORDINATES, ensure_agreement, record, with_warnings
 from lfpiv_cli.flow.combining import Paths, vectors_from_paths
@@ -63,7 +58,7 @@ class Mean(Batch[None]):
 
 def _ensure_room(files: Sequence[Path]) -> None:
     """Refuse files whose samples do not fit into the memory together (OutputError)."""
-    ensure_room(HELD_OVER_FILES * sum(map(unpacked_bytes, files)), "statistics", "fewer files need less")
+    inputs.ensure_room(HELD_OVER_FILES * sum(map(hdf5.unpacked_bytes, files)), "statistics", "fewer files need less")
 
 
 def _named(files: Sequence[Path]) -> dict[str, Path]:
@@ -90,7 +85,7 @@ def are_measured(files: Sequence[Path]) -> bool:
     """Return whether files are vectors or tracks, by the first that can be read: no volumes."""
     for path in files:
         try:
-            return format_of(path) in MEASURED
+            return hdf5.format_of(path) in MEASURED
         except InputError:
             continue
     return False
@@ -103,7 +98,7 @@ def _alike(files: Sequence[Path], in_bins: bool) -> tuple[list[Path], list[dict[
     ------
     InputError : they were not made alike, or are no vectors and no tracks
     """
-    formats = {path: format_of(path) for path in sorted(files, key=lambda path: natural(str(path)))}
+    formats = {path: hdf5.format_of(path) for path in sorted(files, key=lambda path: listing.natural(str(path)))}
     for path, name in formats.items():
         if name not in MEASURED:
             raise InputError(f"{path}: holds {name}, expected vectors or tracks")
@@ -144,11 +139,11 @@ def mean_of_measured(
 
 def _fields_in(path: Path) -> Iterator[VectorField]:
     """Yield the vectors in a file, of tracks those on the grid of the interrogation windows, a field a frame."""
-    if format_of(path) == vtkhdf.VECTORS_FORMAT:
+    if hdf5.format_of(path) == vtkhdf.VECTORS_FORMAT:
         yield vtkhdf.open_vectors(path)
         return
     tracks = open_tracks(path)
-    settings = carried_config(tracks.provenance, path)
+    settings = config.carried_config(tracks.provenance, path)
     windows = windows_of(settings, settings.masking_walls())
     frames: Iterable[int | None] = [None]
     if "frame" in tracks.arrays:
@@ -190,10 +185,10 @@ def statistics_of_files(
     ------
     InputError : they are not of one kind, or were not made alike
     """
-    ensure_writable(output, overwrite or options.resume, files)
+    atomic.ensure_writable(output, overwrite or options.resume, files)
     parse_profile(options.profile)
     files, records = _alike(files, in_bins=options.bin_mm is not None)
-    by_fields = format_of(files[0]) == vtkhdf.VECTORS_FORMAT
+    by_fields = hdf5.format_of(files[0]) == vtkhdf.VECTORS_FORMAT
     if by_fields and options.bin_mm is not None:
         raise UsageError(f"--bin-mm: bins are of tracks, and {files[0]} has vectors on a grid")
     chosen: dict[str, Any] = {"profile": options.profile}

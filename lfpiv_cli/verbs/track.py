@@ -13,11 +13,9 @@ from typing import Any
 import numpy as np
 
 from lfpiv_cli.console import CONSOLE, Console, Frames
-from lfpiv_cli.files import particle_file, vtkhdf
+from lfpiv_cli.files import hdf5, inputs, particle_file, vtkhdf
 from lfpiv_cli.files.batch import Target, output_paths, results_seen
 from lfpiv_cli.files.config import Config
-from lfpiv_cli.files.hdf5 import fault_of
-from lfpiv_cli.files.inputs import given
 from lfpiv_cli.files.pairing import Pairs, in_order
 from lfpiv_cli.files.provenance import carried_record, record, seconds_between, with_warnings
 from lfpiv_cli.flow.field import REJECTED
@@ -157,7 +155,7 @@ class Tracks(PairBatch[Outcome, TrackOptions]):
 
     def fault(self, number: int) -> str | None:
         """Return why particles of a result cannot be opened."""
-        return fault_of(self._groups[number])
+        return hdf5.fault_of(self._groups[number])
 
     def make(self, number: int, work: Frames) -> Outcome:
         """Follow the particles of a pair, or of all frames; write tracks, and vectors where they are asked for."""
@@ -249,7 +247,7 @@ def grid_paths(output: Path, intervals: int) -> list[Path]:
 def _roles(particles: Sequence[Path]) -> dict[str, Path]:
     """Return files of particles by their role."""
     if len(particles) == 2:
-        return given(particles_a=particles[0], particles_b=particles[1])
+        return inputs.given(particles_a=particles[0], particles_b=particles[1])
     return {f"particles_{number:04d}": path for number, path in enumerate(particles)}
 
 
