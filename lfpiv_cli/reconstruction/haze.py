@@ -63,9 +63,9 @@ class Lenses(NamedTuple):
     The first one has the indices `first` (i, j) on the lattice.
     """
 
-    number: NDArray[np.int64]
+    number: Integers
     shape: tuple[int, int]
-    first: NDArray[np.int64]
+    first: Integers
 
     @classmethod
     def of(cls, lattice_px: Lattice, image_shape: tuple[int, int]) -> Lenses:
@@ -81,11 +81,11 @@ class Lenses(NamedTuple):
         ni, nj = (int(n) + 1 for n in indices.max(axis=(0, 1)))
         return cls((indices[..., 1] * ni + indices[..., 0]).ravel(), (nj, ni), least)
 
-    def sums(self, values: NDArray[Any]) -> NDArray[np.float64]:
+    def sums(self, values: NDArray[Any]) -> Floats:
         """Return the sum of pixels' values over each microlens (nj, ni)."""
         return self.of_some(slice(None), values)
 
-    def of_some(self, pixels: NDArray[Any] | slice, values: NDArray[Any] | None = None) -> NDArray[np.float64]:
+    def of_some(self, pixels: NDArray[Any] | slice, values: NDArray[Any] | None = None) -> Floats:
         """Return the sum of some pixels' values over each microlens (nj, ni), or their number."""
         total = np.bincount(self.number[pixels], values, math.prod(self.shape)).astype(np.float64)
         return total.reshape(self.shape)

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Singles
 from lfpiv_cli.calibration import light_checks
 from lfpiv_cli.calibration.lens_light import LensImages, dark_level
 from lfpiv_cli.calibration.model import Calibration
@@ -38,7 +38,7 @@ from lfpiv_cli.weights.lens_cells import aligned
 # The lines are those of `verbs.planning`. Images are raw, [row, column], in counts.
 
 
-Image = NDArray[np.float32]
+Image = Singles
 
 # The brightest pixels but so many show what tracers' light is; noise alone reaches five standard deviations there.
 BRIGHTEST, GOOD_SIGNAL, LEAST_SIGNAL = 200, 20.0, 7.0

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Flags, Singles
 from lfpiv_cli.console import CONSOLE, Console, Frames
 from lfpiv_cli.errors import InputError, LfpivError, UsageError
 from lfpiv_cli.files import atomic, hdf5, provenance, vtkhdf
@@ -93,7 +94,7 @@ def correlate(
     return replace(field, reference=first.reference, provenance=made)
 
 
-def usable_voxels(settings: Config, grid: Grid, mask: NDArray[Any] | None) -> NDArray[np.bool_] | None:
+def usable_voxels(settings: Config, grid: Grid, mask: NDArray[Any] | None) -> Flags | None:
     """Return where volumes may be used (nz, ny, nx): between walls and where a mask is above 0; None: everywhere."""
     walls = settings.masking_walls()
     usable = None if walls is None else inside(grid, walls)
@@ -298,7 +299,7 @@ class Correlation(PairBatch[Outcome, CorrelateOptions]):
         if drawn is not None and drawn.grid != first.grid:
             raise InputError(f"{mask}: its grid {drawn.grid} differs from that of {one}, {first.grid}")
 
-        def volumes() -> Iterator[tuple[NDArray[np.float32], NDArray[np.float32]]]:
+        def volumes() -> Iterator[tuple[Singles, Singles]]:
             for pair in pairs:
                 a, b = (first if path == one else vtkhdf.open_volume(path) for path in pair)
                 for path, volume in zip(pair, (a, b), strict=True):

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lfpiv_cli.arrays import Floats
+from lfpiv_cli.arrays import Flags, Floats
 from lfpiv_cli.errors import InputError, UsageError
 from lfpiv_cli.fields import fit
 from lfpiv_cli.fields.spline_field import SplineField, gradient_covariance_at
@@ -119,7 +119,7 @@ class FittedField(ArrayResult):
             reported |= {"dissipation_m2_s3": rate, "dissipation_m2_s3_sigma": error}
         return reported
 
-    def without(self) -> NDArray[np.bool_]:
+    def without(self) -> Flags:
         """Return at which windows' centres (nz, ny, nx) there is no vector: none near, or beyond walls."""
         nodes, masked = self.windows.centres.centres_mm().reshape(-1, 3), self.windows.masked()
         return np.asarray(masked | without_tracks(self.middles_mm, nodes, self.windows).reshape(masked.shape))

@@ -18,7 +18,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from lfpiv_cli.arrays import Floats
+from lfpiv_cli.arrays import Floats, Singles
 from lfpiv_cli.calibration import light_checks
 from lfpiv_cli.calibration.lens_light import LensImages
 from lfpiv_cli.calibration.rectification import Rectification
@@ -140,7 +140,7 @@ def reader(
         return read_frame(frames[number], shape)
 
     @lru_cache(maxsize=1)
-    def over(numbers: range) -> NDArray[np.float32]:
+    def over(numbers: range) -> Singles:
         return BACKGROUNDS[level.kind or ""](readable(page, numbers, keep_going))
 
     def read(number: int) -> tuple[Image, Image]:
@@ -376,7 +376,7 @@ def haze_notices(attributes: Mapping[str, Any], name: str) -> list[Notice]:
     return [Notice("haze", name, text, remedy, level, "none above the noise")]
 
 
-def _noise(seen: NDArray[np.float32]) -> float:
+def _noise(seen: Singles) -> float:
     """Return at most the standard deviation of an image's noise, its unusable pixels NaN.
 
     By what lies below 0, around the median, or between pixels side by side: crowded tracers leave no pixel dark

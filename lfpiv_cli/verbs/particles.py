@@ -235,26 +235,20 @@ def find(bench: Bench, frame: Frame, progress: Callable[[int], None] | None = No
     return result(task, first_pass(task, progress=progress))
 
 
-def find_first(bench: Bench, frame: Frame, progress: Callable[[int], None] | None = None) -> NDArray[np.float64]:
+def find_first(bench: Bench, frame: Frame, progress: Callable[[int], None] | None = None) -> Floats:
     """Return the particles (n, 4) of a frame's first pass, for its own second pass and those of its neighbours."""
     return first_pass(task_for(bench, frame), progress=progress).particles
 
 
 def find_second(
-    bench: Bench,
-    frame: Frame,
-    before: Frame,
-    particles: NDArray[np.float64],
-    progress: Callable[[int], None] | None = None,
-) -> NDArray[np.float64]:
+    bench: Bench, frame: Frame, before: Frame, particles: Floats, progress: Callable[[int], None] | None = None
+) -> Floats:
     """Return what `find_first` returns, for the second frame of a pair: with those (n, 4) of the first, `before`."""
     task = task_for(bench, frame)
     return second_frame(task, task_for(bench, before), particles, progress)
 
 
-def find_beside(
-    bench: Bench, frame: Frame, own: NDArray[np.float64], neighbours: Sequence[NDArray[np.float64]]
-) -> Particles:
+def find_beside(bench: Bench, frame: Frame, own: Floats, neighbours: Sequence[Floats]) -> Particles:
     """Return the particles behind an image with the help of the first passes of it and of the frames beside it."""
     task = task_for(bench, frame)
     return result(task, second_pass(task, own, neighbours))
@@ -363,7 +357,7 @@ def _focal_length(bench: Bench, frame: Frame, found: Particles) -> FocalLength |
     return focal_length_of(view, particles, residual, weight)
 
 
-def what_is_left(frame: Frame, found: Particles) -> NDArray[np.float64]:
+def what_is_left(frame: Frame, found: Particles) -> Floats:
     """Return what particles leave of an image (rows, columns), counts, 0 where it takes no part."""
     return np.where(frame.unusable, 0.0, found.residual)
 
@@ -412,7 +406,7 @@ class Finder:
         self._bench, self._read, self._frames = bench, read, frames
         self._beside, self._first_of, self._keep_going = beside, first_of, keep_going
         # A frame needs itself and one at either side, the next one two of these again.
-        self._first_pass_of: Callable[[int], NDArray[np.float64]] = lru_cache(maxsize=3)(self._first_pass)
+        self._first_pass_of: Callable[[int], Floats] = lru_cache(maxsize=3)(self._first_pass)
         self._advance: Progress | None = None
 
     def find(self, number: int, frame: Frame, advance: Progress) -> tuple[Particles, list[Notice]]:
@@ -439,7 +433,7 @@ class Finder:
         seen = {k: self._first_pass_of(k) for k in sorted((number, *helping))}
         return find_beside(self._bench, frame, seen[number], [seen[k] for k in helping]), notices
 
-    def _first_pass(self, number: int) -> NDArray[np.float64]:
+    def _first_pass(self, number: int) -> Floats:
         frame, first = self._frame(number), self._first_of.get(number)
         if first is None:
             return find_first(self._bench, frame, self._advance)

@@ -12,9 +12,8 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from lfpiv_cli.arrays import Floats
+from lfpiv_cli.arrays import Floats, Integers
 from lfpiv_cli.calibration.model import Calibration
 from lfpiv_cli.calibration.sheet import LARGE_F_RATIO, LARGEST_F_RATIO
 from lfpiv_cli.errors import ConfigError, InputError
@@ -123,7 +122,7 @@ class Bench:
         return planning.errors_by_depth_mm(seen, tracer)[places]
 
     @cached_property
-    def seen(self) -> tuple[list[Miniature], NDArray[np.int64]]:
+    def seen(self) -> tuple[list[Miniature], Integers]:
         """How tracers look at `depths_mm`, by the light they are fitted with, and which of those depths each is."""
         far = FARTHEST_FIELDS * planning.depth_of_field_mm(self.camera, self.media)
         depths_mm, places = np.unique(np.clip(self.depths_mm, -far, far), return_inverse=True)

@@ -7,9 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
-from lfpiv_cli.arrays import Floats
+from lfpiv_cli.arrays import Flags, Floats
 from lfpiv_cli.console import CONSOLE, Console, readable
 from lfpiv_cli.errors import ConfigError, InputError, LimitMissedError, UsageError
 from lfpiv_cli.files import vtkhdf
@@ -294,7 +293,7 @@ def light_notices(settings: Config) -> list[Notice]:
     return [Notice("light-differs", "simulation.light", text, remedy)]
 
 
-def _truth_of_particles(path: Path, centres_mm: Floats) -> tuple[Floats, NDArray[np.bool_]]:
+def _truth_of_particles(path: Path, centres_mm: Floats) -> tuple[Floats, Flags]:
     """Return the true velocities at the window centres, z from the focal point, and which lie among the particles."""
     particles = read_particles(path)
     lit = particles.brightness[:, np.newaxis] > 0.0

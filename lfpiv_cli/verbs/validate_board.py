@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Singles
 from lfpiv_cli.calibration.board import dots_in_world
 from lfpiv_cli.calibration.dlfc import fit_rays
 from lfpiv_cli.calibration.model import Photographs, Rig, calibrate
@@ -72,7 +72,7 @@ class BoardBench:
         return replace(self, weights=replace(self.weights, solver_operator=operator, scene_distortion_per_mm2=None))
 
 
-BoardSolver = Callable[[NDArray[np.float32], Callable[[int], None]], Reconstruction]
+BoardSolver = Callable[[Singles, Callable[[int], None]], Reconstruction]
 
 # Two make a step in depth, a third the polynomials of fitted rays.
 FEWEST_DEPTHS = 3
@@ -179,10 +179,7 @@ def bench_of(settings: Config, half: str) -> BoardBench:
 
 
 def _discs(
-    bench: BoardBench,
-    pictures: Sequence[NDArray[np.float32]],
-    depths_mm: tuple[float, ...],
-    advance: Callable[[int], None],
+    bench: BoardBench, pictures: Sequence[Singles], depths_mm: tuple[float, ...], advance: Callable[[int], None]
 ) -> dict[str, Any]:
     """Return the errors of place of dots that are fitted to the pictures as discs."""
     calibration, rig = bench.weights.calibration, bench.rig
@@ -196,12 +193,8 @@ def _discs(
 
 
 def board_in(
-    bench: BoardBench,
-    solve: BoardSolver,
-    picture: NDArray[np.float32],
-    placement: BoardPlacement,
-    advance: Callable[[int], None],
-) -> tuple[of_boards.DotFigures, NDArray[np.float32], float]:
+    bench: BoardBench, solve: BoardSolver, picture: Singles, placement: BoardPlacement, advance: Callable[[int], None]
+) -> tuple[of_boards.DotFigures, Singles, float]:
     """Return what is measured of the board in a picture, its volume [z, y, x], and the solver's last residual."""
     board, result = bench.rig.board, solve(picture, advance)
     volume = bench.weights.to_world(result.volume)
@@ -218,7 +211,7 @@ def board_solver(bench: BoardBench, settings: Config) -> BoardSolver:
     solver = replace(settings.solver_settings(), stopping=ALL_ITERATIONS)
     sums = None if bench.weights.on_demand else normalisers(bench.weights.padded, bench.excluded)
 
-    def solve(picture: NDArray[np.float32], advance: Callable[[int], None]) -> Reconstruction:
+    def solve(picture: Singles, advance: Callable[[int], None]) -> Reconstruction:
         operator = bench.weights.padded.for_image(picture)
         return reconstruct(
             operator, picture, solver, sums=sums or normalisers(operator, bench.excluded), progress=advance
