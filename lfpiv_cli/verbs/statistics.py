@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +19,9 @@ from lfpiv_cli.flow.combining import Paths, vectors_from_paths
 from lfpiv_cli.flow.field import REJECTED, VectorField, derived_fields
 from lfpiv_cli.verbs.batches import Batch, BatchOptions, work_through
 from lfpiv_cli.verbs.checks import quality_of
-from lfpiv_cli.verbs.fields import Extra, arrays_of, samples_of_tracks
-from lfpiv_cli.verbs.moments import FlowStatistics, notices_of, of_fields, of_tracks, parse_profile
+from lfpiv_cli.verbs.fields import arrays_of, samples_of_tracks
+from lfpiv_cli.verbs.moments import notices_of, of_fields, of_tracks, parse_profile
+from lfpiv_cli.verbs.results import Vectors
 from lfpiv_cli.verbs.tracks import windows_of
 
 MEASURED = (vtkhdf.VECTORS_FORMAT, TRACKS_FORMAT, TRAJECTORIES_FORMAT)
@@ -50,7 +51,8 @@ class Mean(Batch[None]):
         """Write it."""
         found, target = of_fields(field for path in self.inputs for field in _fields_in(path)), self.targets[number]
         extra = arrays_of(derived_fields(found.mean)) if self._derived else {}
-        _write(target.path, found, self.inputs[0], target.record, extra, overwrite=True)
+        mean = replace(found.mean, provenance=dict(target.record))
+        Vectors(mean, found.arrays() | extra, found.tables(), found.attributes()).write(target.path, overwrite=True)
 
     def _record(self) -> dict[str, Any]:
         return record("correlate mean", self._resolved, _named(self.inputs))
@@ -63,22 +65,6 @@ def _ensure_room(files: Sequence[Path]) -> None:
 
 def _named(files: Sequence[Path]) -> dict[str, Path]:
     return {f"vectors_{number:04d}": path for number, path in enumerate(files)}
-
-
-def _write(
-    path: Path, found: FlowStatistics, like: Path, made: Mapping[str, Any], extra: Extra, *, overwrite: bool
-) -> None:
-    """Write statistics as vectors with more arrays; the origin of their coordinates is that of a file like them."""
-    vtkhdf.write_vectors(
-        path,
-        found.mean,
-        vtkhdf.read_header(like).reference,
-        provenance=made,
-        overwrite=overwrite,
-        extra=found.arrays() | extra,
-        attributes=found.attributes(),
-        tables=found.tables(),
-    )
 
 
 def are_measured(files: Sequence[Path]) -> bool:
@@ -150,7 +136,8 @@ def _fields_in(path: Path) -> Iterator[VectorField]:
         frames = range(int(tracks.arrays["frame"].max(initial=-1)) + 1)
     for each in [samples_of_tracks(tracks, frame) for frame in frames]:
         sigma_mm = np.sqrt(np.diagonal(each.covariance_mm2, axis1=1, axis2=2))
-        yield vectors_from_paths(Paths(each.points_mm, each.value_mm, sigma_mm), windows, settings.correlation.dt_s)
+        paths = Paths(each.points_mm, each.value_mm, sigma_mm)
+        yield replace(vectors_from_paths(paths, windows, settings.correlation.dt_s), reference=tracks.reference)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -209,5 +196,5 @@ def statistics_of_files(
         notices = notices_of(summary, output.name)
         console.warn(notices)
         made = with_warnings(made, notices)
-        _write(output, found, files[0], made, {}, overwrite=overwrite or options.resume)
+        Vectors.of(replace(found, mean=replace(found.mean, provenance=made))).write(output, overwrite or options.resume)
     return summary | {"skipped": int(kept)}
