@@ -34,7 +34,7 @@ from lfpiv_cli.verbs.batches import ALL, Batch, BatchOptions, Failure, WorkOptio
 from lfpiv_cli.verbs.checks import few_notices
 from lfpiv_cli.verbs.following import SHORTEST, BothWays, Forwards, Recorded, ensure_sequence
 from lfpiv_cli.verbs.frames import ImageOptions
-from lfpiv_cli.verbs.particles import open_weights_that_fit, searchable_weights
+from lfpiv_cli.verbs.particles import Prepared
 from lfpiv_cli.verbs.reconstruct import file_notices
 from lfpiv_cli.verbs.tracers import size_notices
 from lfpiv_cli.verbs.track import SeenFrames, stored_tracks
@@ -152,7 +152,8 @@ def follow_particles(
     order, notices = pairing.in_order(images_seen(frames))
     frames = [frames[number] for number in order]
     console.warn(notices)
-    content = open_weights_that_fit(weights)
+    prepared = Prepared()
+    content = prepared.weights(weights)
     settings = carried_config(content.provenance, weights).overridden("reconstruction", solver="particles")
     settings = settings.overridden("correlation", dt_s=options.dt_s)
     steps = [before.seconds_to(after) for before, after in pairwise(frames)]
@@ -178,7 +179,7 @@ def follow_particles(
         there_again = pending([last.targets[k] for k in there], last.inputs, overwrite, options.resume, dry=True)
         last.ensure_residuals([there[k] for k in there_again])
     sequence, said = _recorded(
-        searchable_weights(weights, content, settings), settings, tracking, frames, ways[0], options, console
+        prepared.searchable(weights, settings), settings, tracking, frames, ways[0], options, console
     )
 
     chosen = BatchOptions(
@@ -207,13 +208,7 @@ def _recorded(
     console: Console,
 ) -> tuple[Recorded, list[Notice]]:
     """Return the sequence as it is followed, its tracers' size known; and what is said of that."""
-    shape = content.image_shape
-    dark = options.dark_image(shape)
-    pitch_px = float(content.camera.micro_image_lattice_px().pitch.max())
-    bench = of_frames.bench_of(
-        content, settings, dark, of_frames.mask_of(options.mask, frames, shape, pitch_px, options.keep_going)
-    )
-    read = of_frames.reader(options.level, frames, shape, dark, options.keep_going)
+    bench, read = Prepared().reading(content, settings, frames, options, options.keep_going)
     bench, size = particles.sized(bench, (particles.frame_of(bench, *read(k)) for k in way.order))
     said = size_notices(settings, size)
     console.warn(said)

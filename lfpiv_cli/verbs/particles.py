@@ -456,7 +456,13 @@ class Prepared:
 
     def __init__(self) -> None:
         """Begin with nothing."""
-        self._opened = lru_cache(maxsize=1)(lambda path, _size, _modified_ns: open_weights_that_fit(path))
+
+        @lru_cache(maxsize=1)
+        def opened(path: Path, *_state: int | None) -> WeightsFile:
+            ensure_room(unpacked_bytes(path), f"reading {path}")
+            return open_weights(path)
+
+        self._opened = opened
         self._searchable: tuple[WeightsFile, WeightsFile] | None = None
         self._bench: Bench | None = None
         self.size: Sized | None = None
@@ -467,15 +473,24 @@ class Prepared:
         Raises
         ------
         InputError : as `open_weights`
+        OutputError : there is too little memory for them
         """
         status = path.stat() if path.exists() else None
         return self._opened(path, status and status.st_size, status and status.st_mtime_ns)
 
     def searchable(self, path: Path, settings: Config) -> WeightsFile:
-        """Return the weights of a file to look for particles with, see `searchable`."""
+        """Return the weights of a file to look for particles with.
+
+        Raises
+        ------
+        InputError : they are none for that, see `searchable`
+        """
         content = self.weights(path)
         if self._searchable is None or self._searchable[0] is not content:
-            self._searchable = content, searchable_weights(path, content, settings)
+            try:
+                self._searchable = content, searchable(content, settings)
+            except ConfigError as error:
+                raise InputError(f"{path}: {error}") from error
         return self._searchable[1]
 
     def bench(self, content: WeightsFile, settings: Config, dark: Image | None, mask: Image | None) -> Bench:
@@ -483,27 +498,17 @@ class Prepared:
         self._bench = of_frames.bench_of(content, settings, dark, mask, earlier=self._bench)
         return self._bench
 
-
-def searchable_weights(path: Path, content: WeightsFile, settings: Config) -> WeightsFile:
-    """Return the weights of a file to look for particles with.
-
-    Raises
-    ------
-    InputError : they are none for that, see `searchable`
-    """
-    try:
-        return searchable(content, settings)
-    except ConfigError as error:
-        raise InputError(f"{path}: {error}") from error
-
-
-def open_weights_that_fit(path: Path) -> WeightsFile:
-    """Open weights, where there is memory for them.
-
-    Raises
-    ------
-    InputError : as `open_weights`
-    OutputError : there is too little
-    """
-    ensure_room(unpacked_bytes(path), f"reading {path}")
-    return open_weights(path)
+    def reading(
+        self,
+        content: WeightsFile,
+        settings: Config,
+        frames: Sequence[ImageFrame],
+        options: of_frames.ImageOptions,
+        keep_going: bool,
+    ) -> tuple[Bench, Read]:
+        """Return what frames share, and what reads one; with `keep_going` some may be unreadable."""
+        shape, dark = content.image_shape, options.dark_image(content.image_shape)
+        pitch_px = float(content.camera.micro_image_lattice_px().pitch.max())
+        mask = of_frames.mask_of(options.mask, frames, shape, pitch_px, keep_going)
+        bench = self.bench(content, settings, dark, mask)
+        return bench, of_frames.reader(options.level, frames, shape, dark, keep_going)

@@ -290,12 +290,7 @@ class Reconstruction(Batch[Outcome]):
                 )
             # The weights are in memory by now.
             ensure_room(held_bytes(voxels, math.prod(content.image_shape)), self.label)
-        shape = content.image_shape
-        dark = options.dark_image(shape)
-        pitch_px = float(content.camera.micro_image_lattice_px().pitch.max())
-        mask = of_frames.mask_of(options.mask, frames, shape, pitch_px, options.keep_going)
-        bench = prepared.bench(content, settings, dark, mask)
-        read = of_frames.reader(options.level, frames, shape, dark, options.keep_going)
+        bench, read = prepared.reading(content, settings, frames, options, options.keep_going)
         size, said = None, []
         if self._as_particles:
             # What cannot be read is told where its turn comes.

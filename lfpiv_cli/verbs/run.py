@@ -35,7 +35,7 @@ from lfpiv_cli.verbs import build_weights, calibrate, checks, correlate, particl
 from lfpiv_cli.verbs.batches import ALL, MB, Expected, Failure, Worked, dry_run, estimate
 from lfpiv_cli.verbs.follow import SEQUENCE_IS_WHOLE, TRACKS, follow_particles
 from lfpiv_cli.verbs.following import SHORTEST, ensure_sequence
-from lfpiv_cli.verbs.frames import Bench, Read, mask_of, other_frames, read_frame, reader
+from lfpiv_cli.verbs.frames import Bench, Read, other_frames, read_frame
 from lfpiv_cli.verbs.pairs import found_pairs
 from lfpiv_cli.verbs.report import ReportOptions, report
 from lfpiv_cli.verbs.run_steps import Chain, RunOptions, Steps, Vectors
@@ -293,13 +293,10 @@ def counted(chain: Chain, weights: Path) -> float | None:
 
 def bench_and_reader(chain: Chain, weights: Path) -> tuple[Bench, Read]:
     """Return what frames share where particles are sought in them, and what reads a frame."""
-    options, frames = chain.options, chain.frames
     content = chain.prepared.searchable(weights, chain.settings)
-    shape = content.image_shape
-    dark = options.dark_image(shape)
     # What stands still would take a look at every image, and a pair hardly shows it better than one counts without.
-    bench = chain.prepared.bench(content, chain.settings, dark, mask_of(options.mask_file, frames, shape, 0.0))
-    return bench, reader(options.level, frames, shape, dark, options.keep_going)
+    options = replace(chain.options, mask=chain.options.mask_file)
+    return chain.prepared.reading(content, chain.settings, chain.frames, options, options.keep_going)
 
 
 def planned(chain: Chain) -> dict[str, Any]:
