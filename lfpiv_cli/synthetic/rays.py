@@ -180,8 +180,7 @@ LENS_PLACES = 24
 def trace_curved(
     part: tuple[int, int],
     placed: tuple[Floats, Floats, Floats],
-    faces: Faces,
-    fit: tuple[Floats, Floats],
+    between: tuple[Faces, tuple[Floats, Floats]],
     camera: KernelCamera,
     objective: Objective,
     blur_mm: Floats,
@@ -192,10 +191,10 @@ def trace_curved(
     Parameters
     ----------
     placed : all balls' centres, their radii, and the shifts of their rays
-    fit : from `fit_of_slopes`
+    between : the faces, and what `fit_of_slopes` gives
     blur_mm : (m, 2) what rays take in turn to end beside where they would
     """
-    points, radii, shifts = placed
+    (points, radii, shifts), (faces, fit) = placed, between
     aperture_radius = camera.aperture_radius_mm
     terms = np.empty(TERMS)
     for i in range(part[0], part[1]):

@@ -140,17 +140,17 @@ def render_points(
     kernel: Callable[..., None] = trace_curved
     placed: tuple[Floats, ...] = (points, radii, shifts)
     if isinstance(space, CurvedSpace):
-        between: tuple[Any, ...] = (space.for_kernels(camera), fit_of_slopes())
+        between: Any = (space.for_kernels(camera), fit_of_slopes())
     else:
         last_layers = space.last_layers_mm(camera, points[:, 2])
         if np.any(last_layers <= 0.0):
             nearest = points[:, 2].min()
             raise ConfigError(f"a point at z = {nearest:g} mm lies {-last_layers.min():g} mm in front of the fluid")
-        kernel, placed, between = _trace_points, (points, radii, last_layers, shifts), (space.layers(camera),)
+        kernel, placed, between = _trace_points, (points, radii, last_layers, shifts), space.layers(camera)
     for part in blocks(len(points), max(RAYS_AT_ONCE // rays, 1)):
         pixels = np.empty((len(points[part]), rays), dtype=np.int32)
         of_part = tuple(each[part] for each in placed)
-        share_out(kernel, len(pixels), of_part, *between, camera.for_kernels(), camera.objective, blur, pixels)
+        share_out(kernel, len(pixels), of_part, between, camera.for_kernels(), camera.objective, blur, pixels)
         _add_light(image.ravel(), pixels, light[part] / rays)
         advance(len(pixels))
     return image
@@ -248,7 +248,7 @@ def render_white(
     centres = camera.micro_image_lattice_px()
     lit = np.empty((camera.rows, camera.columns), dtype=np.int64)
     seen = camera.for_kernels(), camera.objective
-    share_out(_backtrack_white, camera.rows, positions, offsets, *seen, centres.origin, centres.basis, lit)
+    share_out(_backtrack_white, camera.rows, positions, offsets, *seen, (centres.origin, centres.basis), lit)
     return lit * np.float64(level / samples)
 
 
@@ -271,12 +271,11 @@ def _backtrack_white(
     offsets: Floats,
     camera: KernelCamera,
     objective: Objective,
-    origin_px: Floats,
-    basis_px: Floats,
+    centres_px: tuple[Floats, Floats],
     lit: Integers,
 ) -> None:
     """Write how many samples of each pixel, rows `part`, come from the aperture, summed over the lenses."""
-    columns, pixel = camera.columns, camera.pixel_mm
+    (origin_px, basis_px), columns, pixel = centres_px, camera.columns, camera.pixel_mm
     middle_x, middle_y = 0.5 * (columns - 1.0), 0.5 * (camera.rows - 1.0)
     to_lens = pixel / (1.0 + camera.microlens_distance_mm / camera.image_distance_mm)
     # Eq. 1 for a ray that meets the array q beside the centre s_u of a lens, solved for X:

@@ -67,8 +67,7 @@ def votes(points: Floats, candidates: Candidates, density_per_mm3: float, scale:
         candidates.displacement_mm[taken] / equal,
         ratio,
         np.ascontiguousarray(neighbours),
-        widths,
-        heights,
+        (widths, heights),
         support,
     )
     score = np.full(len(candidates.first), -np.inf)
@@ -83,11 +82,14 @@ def _support(
     displacement: Floats,
     ratio: Floats,
     neighbours: Integers,
-    widths: Floats,
-    heights: Floats,
+    kernels: tuple[Floats, Floats],
     support: Floats,
 ) -> None:
-    """Write the sum over a particle's neighbours of how well one of their pairs resembles each of its own."""
+    """Write the sum over a particle's neighbours of how well one of their pairs resembles each of its own.
+
+    `kernels` are Gaussians' widths and heights.
+    """
+    widths, heights = kernels
     furthest2 = (REACH * widths[-1]) ** 2
     for n in range(part[0], part[1]):
         for c in range(begin[n], begin[n + 1]):
