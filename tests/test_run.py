@@ -14,7 +14,7 @@ import tifffile
 from lfpiv_cli.console import Console
 from lfpiv_cli.errors import ConfigError, InputError, LfpivError, OutputExistsError, PartialError, UsageError
 from lfpiv_cli.files.provenance import carried_record, differences
-from lfpiv_cli.verbs import particles
+from lfpiv_cli.verbs import particles, run_choice
 from lfpiv_cli.verbs import report as report_stage
 from lfpiv_cli.verbs import run as stage
 from lfpiv_cli.verbs.report import report
@@ -252,7 +252,7 @@ def test_the_report_is_made_of_what_was_made(again: Path, monkeypatch: pytest.Mo
         page.write_text("<html>")
         return {"verdict": {"vectors": "good"}}
 
-    monkeypatch.setattr(stage, "report", report)
+    monkeypatch.setattr(run_choice, "report", report)
     for _ in range(2):
         run(again / "rig.yaml", again / "out", "--report")
     assert made == [(again / "out", {"pair_a.tif", "pair_b.tif", "white.tif", "board.tif"})]
@@ -358,7 +358,7 @@ def test_the_method_is_what_errs_less(
     count: float | None, method: Any, methods: tuple[str, ...], said: str, tmp_path: Path
 ) -> None:
     settings = stage.load_rig(rig_in(tmp_path))
-    choice = stage.chosen(settings, RunOptions(images=PAIR, method=method), lambda: count)
+    choice = run_choice.chosen(settings, RunOptions(images=PAIR, method=method), lambda: count)
     assert choice.methods == methods
     assert said in choice.reason
     assert choice.tracers_per_lens == count

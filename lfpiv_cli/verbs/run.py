@@ -12,55 +12,44 @@ are any, nothing else can be complete: frames and pairs are counted, and their f
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import math
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
-from itertools import pairwise
+import time
+from collections import deque
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import groupby, pairwise
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
+
+import numpy as np
 
 from lfpiv_cli.console import CONSOLE, Console
-from lfpiv_cli.errors import ConfigError, InputError, LfpivError, OutputExistsError, PartialError, UsageError
-from lfpiv_cli.files import atomic, calibration_file, inputs, pages
+from lfpiv_cli.errors import InputError, LfpivError, OutputExistsError, UsageError
+from lfpiv_cli.files import atomic, calibration_file
 from lfpiv_cli.files import images as image_files
 from lfpiv_cli.files.batch import Frame, frames_of, images_seen, output_paths, pending
 from lfpiv_cli.files.config import Config, load_rig
+from lfpiv_cli.files.pages import Page, Picture, Section, Table, write_pages, write_picture
 from lfpiv_cli.files.pairing import Pairs
 from lfpiv_cli.files.provenance import Gone, carried_record, sha256, without_warnings
+from lfpiv_cli.files.vtkhdf import open_vectors
+from lfpiv_cli.flow.field import VALID, VectorField
 from lfpiv_cli.names import FlowMethod
-from lfpiv_cli.notice import written
-from lfpiv_cli.verbs import build_weights, calibrate, checks, correlate, particles, run_steps
-from lfpiv_cli.verbs.batches import ALL, MB, Expected, Failure, Worked, dry_run, estimate
-from lfpiv_cli.verbs.follow import SEQUENCE_IS_WHOLE, TRACKS, follow_particles
+from lfpiv_cli.notice import with_error, written
+from lfpiv_cli.pictures.vectors import planes_figure
+from lfpiv_cli.verbs import build_weights, calibrate, checks, correlate, particles, run_choice, run_steps
+from lfpiv_cli.verbs.batches import ALL, MB, Expected, Failure, dry_run, estimate
+from lfpiv_cli.verbs.follow import follow_particles
 from lfpiv_cli.verbs.following import SHORTEST, ensure_sequence
-from lfpiv_cli.verbs.frames import Bench, Read, other_frames, read_frame
-from lfpiv_cli.verbs.pairs import found_pairs
-from lfpiv_cli.verbs.report import ReportOptions, report
-from lfpiv_cli.verbs.run_steps import Chain, RunOptions, Steps, Vectors
+from lfpiv_cli.verbs.frames import readable
+from lfpiv_cli.verbs.pairs import coming_pairs, found_pairs, watched
+from lfpiv_cli.verbs.particles import LOOKED_AT, Prepared
+from lfpiv_cli.verbs.report import contents_of, judged
+from lfpiv_cli.verbs.run_choice import Choice
+from lfpiv_cli.verbs.run_steps import Chain, RunOptions, Steps
 from lfpiv_cli.verbs.simulate import frame_names, simulate_board, simulate_particles, simulate_white
 from lfpiv_cli.verbs.weights_cost import FLOAT_BYTES, Cost, cost_of, ensure_volume_fits
-
-REPORT = "report.html"
-
-# Vectors by particles err less than those by volumes up to 1.9 tracers for each microlens, and more from 2.4 on, in the
-# laminar channel of the paper.
-MOST_FOR_PARTICLES = 2.0
-
-
-@dataclass(frozen=True)
-class Choice:
-    """By which methods a flow is measured, and why; the tracers for each microlens where they were counted."""
-
-    methods: tuple[FlowMethod, ...]
-    reason: str
-    tracers_per_lens: float | None = None
-
-    def reported(self) -> dict[str, Any]:
-        """Return what is told of it."""
-        method = self.methods[0] if len(self.methods) == 1 else "both"
-        return {"method": method, "reason": self.reason, "tracers_per_lens": self.tracers_per_lens}
 
 
 def run(
@@ -74,8 +63,6 @@ def run(
     """
     settings = load_rig(config)
     if options.watch:
-        from lfpiv_cli.verbs.watch import watch
-
         return watch(config, settings, output, options, overwrite, console)
     frames, pairs = _ensure_possible(settings, options)
     console.warn(pairs.settled(options.keep_going))
@@ -84,138 +71,15 @@ def run(
     if not options.dry_run:
         ensure_volume_fits(settings, options.method in ("volumes", "both"))
     try:
-        return planned(chain) if options.dry_run else take_all(chain)
+        return planned(chain) if options.dry_run else run_choice.take_all(chain)
     except OutputExistsError as error:
         chain.overwrite = True
         raise OutputExistsError(f"{error}{with_overwrite(chain)}") from error
 
 
-def take_all(chain: Chain) -> dict[str, Any]:
-    """Take all steps; return what is told of them (PartialError: something failed)."""
-    steps, options, output = chain.steps, chain.options, chain.steps.output
-    atomic.ensure_writable(output / run_steps.RECORD, overwrite=True)
-    weights = chain.weights()
-    if not chain.share:
-        return steps.summary()
-    choice = chosen(chain.settings, options, lambda: counted(chain, weights))
-    steps.console.say(f"by {' and '.join(choice.methods)}: {choice.reason}")
-    steps.reported.update(choice.reported())
-    fields = measured(chain, choice, weights)
-    figures = checks.figures_of({method: list(paths.values()) for method, paths in fields.items()})
-    steps.reported["figures"] = figures
-    reported = choice.reported() | figures
-    if options.report and options.shard == ALL:
-        raw = (
-            *dict.fromkeys(frame.path for frame in chain.frames if frame.fault is None),
-            *options.white,
-            *options.board,
-        )
-        page = output / REPORT
-        is_kept = page.exists() and not steps.count(run_steps.MADE)
-
-        def make() -> dict[str, Any]:
-            # Of all that the folder holds, where a step has made anything.
-            if is_kept:
-                return {}
-            replacing = chain.overwrite or bool(steps.earlier)
-            return report(output, page, ReportOptions(raw=raw), overwrite=replacing, console=steps.console)
-
-        of_page = steps.take("report", [page], make)
-        reported |= {"sentence": of_page.get("sentence"), "verdict": of_page.get("verdict"), "report": str(page)}
-    steps.write(whole=True)
-    reported |= steps.summary()
-    # By both methods a frame fails twice.
-    worked = Worked[None](failures=list(dict.fromkeys(chain.failures)))
-    worked.list_failures(options.failures)
-    reported["summary"] = in_words(chain, reported, [*fields.values()][-1], worked.failures)
-    if worked.failures:
-        first, records = worked.failures[0], [asdict(failure) for failure in worked.failures]
-        number = "one frame or pair" if len(records) == 1 else f"{len(records)} frames or pairs"
-        text = f"{number} failed, the first {first.name}: {first.error}"
-        raise PartialError(text, reported | {"failures": records})
-    return reported
-
-
-def in_words(chain: Chain, reported: Mapping[str, Any], vectors: Vectors, failures: Sequence[Failure]) -> list[str]:
-    """Return what a person wants to know of a run: what was found, what was made, and what to open next."""
-    steps, output = chain.steps, chain.steps.output
-    found: dict[str, list[str]] = {run_steps.MADE: [], run_steps.KEPT: []}
-    for step in steps.reported["steps"].values():
-        names = found[run_steps.MADE if step["state"] == run_steps.MADE else run_steps.KEPT]
-        names += [name for name in dict.fromkeys(file.split("/")[0] for file in step["files"]) if name not in names]
-    files = [f"{state}: {', '.join(names)}" for state, names in found.items() if names]
-    flow = next(iter(vectors.values()), output / TRACKS if chain.options.follow else None)
-    shown = [f"{reported['report']} in a browser"] if "report" in reported else []
-    shown += [f"{flow} in ParaView"] if flow is not None else []
-    return [
-        *filter(None, [reported.get("sentence")]),
-        f"by {reported['method'].replace('both', 'volumes and particles')}: {reported['reason']}",
-        *(f"failed: {failure.name}: {failure.error}" for failure in failures),
-        *files,
-        f"open next: {', '.join(shown)}" if shown else f"all is in {output}",
-        f"all figures: --json, -v, or {output / run_steps.RECORD}",
-    ]
-
-
-def measured(chain: Chain, choice: Choice, weights: Path) -> dict[str, Vectors]:
-    """Return the files of vectors by each method; those that err least are the last."""
-    fields: dict[str, Vectors] = {method: chain.vectors_by(method, weights) for method in choice.methods}
-    if chain.options.combine:
-        fields["combined"] = chain.combined(fields["volumes"], fields["particles"])
-    return fields
-
-
-def ensure_inputs(settings: Config, options: RunOptions) -> None:
-    """Raise where settings, photographs or outputs are wrong, as far as it is known before the images are read."""
-    if options.dt_s is None and settings.correlation.dt_s is None:
-        # Whether recordings say when each frame was taken, those that can be read.
-        reported = []
-        for path in options.images:
-            try:
-                reported.append(image_files.frames(path).time_s is not None)
-            except InputError:
-                if not options.keep_going:
-                    raise
-        if not reported or not all(reported):
-            raise ConfigError(
-                f"{settings.source}: correlation.dt_s: is missing, and velocities need it; give it there, or --dt-s"
-            )
-    settings.camera_model()
-    settings.grid()
-    if options.board:
-        settings.rig()
-    if settings.weights.method != "dlfc" and settings.channel is None:
-        settings.object_space()
-    by_volumes, by_particles = (options.method in (method, "both") for method in ("volumes", "particles"))
-    if options.combine and options.method != "both":
-        raise UsageError("--combine needs --method both")
-    if options.follow and options.method == "volumes":
-        raise UsageError("--follow finds particles, but --method is volumes")
-    if options.follow and options.shard != ALL:
-        raise UsageError(SEQUENCE_IS_WHOLE)
-    if options.follow and options.dask:
-        raise UsageError("--dask: a sequence is followed from frame to frame, which workers cannot share")
-    if options.follow and options.combine:
-        raise UsageError("--follow gives tracks, and --combine needs vectors")
-    if by_volumes and settings.reconstruction.solver == "particles":
-        raise ConfigError(f"{settings.source}: reconstruction.solver: is particles; volumes need another one")
-    if settings.weights.method == "dlfc" and (options.follow or by_particles):
-        raise ConfigError(f"{settings.source}: weights.method: is dlfc, but particles are fitted with traced rays")
-    pages.ensure_drawing()
-    if options.report:
-        pages.ensure_pages()
-    calibrate.ensure_pictures(len(options.white), len(options.board), len(options.depth_mm))
-    for path in (*options.white, *options.board):
-        inputs.ensure_regular_file(inputs.split_part(path)[0])
-    for path in filter(None, (options.dark, options.level.path, options.mask_file)):
-        image_files.read_reference(path, settings.image_shape())
-    if options.failures is not None:
-        atomic.ensure_writable(options.failures, overwrite=True)
-
-
 def _ensure_possible(settings: Config, options: RunOptions) -> tuple[list[Frame], Pairs]:
     """Return the frames of the flow and their pairs, after all that can be known to be wrong has been asked for."""
-    ensure_inputs(settings, options)
+    run_choice.ensure_inputs(settings, options)
     frames = frames_of(options.images, options.keep_going)
     if options.follow:
         ensure_sequence(len(frames), SHORTEST)
@@ -224,79 +88,12 @@ def _ensure_possible(settings: Config, options: RunOptions) -> tuple[list[Frame]
         pairs = found_pairs(images_seen(frames), options)
         pairs.settled(options.keep_going)
     output_paths(Path(), [frame.stem for frame in frames])
-    _first_readable(frames, settings.image_shape(), options.keep_going)
+    run_choice.first_readable(frames, settings.image_shape(), options.keep_going)
     if not options.keep_going:
         for path in dict.fromkeys(frame.path for frame in frames):
             if image_files.frames(path).shape != settings.image_shape():
                 image_files.read_image(path, 0, settings.image_shape())  # says what is wrong, before any is read
     return frames, pairs
-
-
-def _first_readable(frames: Sequence[Frame], shape: tuple[int, int], keep_going: bool) -> int:
-    """Return the number of the first frame; of those that can be read, where the others are to go on.
-
-    Raises
-    ------
-    InputError : it cannot be read, or none can
-    """
-    for number, frame in enumerate(frames):
-        try:
-            read_frame(frame, shape)
-        except InputError:
-            if not keep_going or number == len(frames) - 1:
-                raise
-        else:
-            return number
-    raise InputError("no images were given")
-
-
-def chosen(settings: Config, options: RunOptions, count_tracers: Callable[[], float | None]) -> Choice:
-    """Return by which methods the flow is measured: those asked for, or what errs less with so many tracers."""
-    if settings.weights.method == "dlfc":
-        return Choice(("volumes",), "weights.method is dlfc, whose fitted rays particles cannot be fitted with")
-    count = count_tracers()
-    asked: FlowMethod | None = "particles" if options.follow else None
-    if options.method == "both":
-        return Choice(("volumes", "particles"), "as --method asks for", count)
-    if options.method != "auto":
-        asked = options.method
-    elif settings.reconstruction.solver == "particles":
-        return Choice(("particles",), "reconstruction.solver is particles", count)
-    if count is None:
-        return Choice((asked or "particles",), "too little is seen of the volume to count tracers by their light")
-    better: FlowMethod = "particles" if count <= MOST_FOR_PARTICLES else "volumes"
-    side = "up to" if better == "particles" else "beyond"
-    reason = (
-        f"{written(count, 2)} tracers for each microlens, and {better} err less {side} about {MOST_FOR_PARTICLES:g}"
-    )
-    if asked is None or asked == better:
-        return Choice((better,), reason, count)
-    return Choice((asked,), f"as asked for; but there are {reason}", count)
-
-
-def counted(chain: Chain, weights: Path) -> float | None:
-    """Return how many tracers for each microlens the first image holds, as the run before has counted if it could."""
-    settings, options, frames, steps = chain.settings, chain.options, chain.frames, chain.steps
-    shape, level = settings.image_shape(), options.level
-    order = chain.pairs.order(len(frames))
-    first = order[_first_readable([frames[k] for k in order], shape, options.keep_going)]
-    files = (weights, frames[first].path, *filter(None, (options.dark, level.path)))
-    mask = "" if options.mask_file is None else sha256(options.mask_file)
-    words = other_frames(level, frames)(first)
-    counted_from = " ".join([*map(sha256, files), str(frames[first].page), mask, words])
-    steps.reported["counted_from"] = hashlib.sha256(counted_from.encode()).hexdigest()
-    if steps.earlier.get("counted_from") == steps.reported["counted_from"] and "tracers_per_lens" in steps.earlier:
-        return cast("float | None", steps.earlier["tracers_per_lens"])
-    bench, read = bench_and_reader(chain, weights)
-    return particles.tracers_per_lens(bench, particles.frame_of(bench, *read(first)))
-
-
-def bench_and_reader(chain: Chain, weights: Path) -> tuple[Bench, Read]:
-    """Return what frames share where particles are sought in them, and what reads a frame."""
-    content = chain.prepared.searchable(weights, chain.settings)
-    # What stands still would take a look at every image, and a pair hardly shows it better than one counts without.
-    options = replace(chain.options, mask=chain.options.mask_file)
-    return chain.prepared.reading(content, chain.settings, chain.frames, options, options.keep_going)
 
 
 def planned(chain: Chain) -> dict[str, Any]:
@@ -320,7 +117,7 @@ def planned(chain: Chain) -> dict[str, Any]:
     if before:
         return counts | _from_nothing(chain)
     weights, to_come = output / run_steps.WEIGHTS, _weights_to_come(chain)
-    methods = chosen(settings, options, lambda: counted(chain, weights)).methods
+    methods = run_choice.chosen(settings, options, lambda: run_choice.counted(chain, weights)).methods
     reported: dict[str, dict[str, Any]] = {}
     for method in methods:
         if options.follow:
@@ -434,6 +231,232 @@ def _together(reported: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
 def _words(key: str, reported: Sequence[Mapping[str, Any]]) -> str | None:
     """Return all the ways in which a figure is known."""
     return "; ".join(dict.fromkeys(each[key] for each in reported if each[key])) or None
+
+
+# `--watch`: each pair of a folder as a camera fills it, with a line for each and the picture of the last one.
+#
+# A pair is taken through the steps of `run` by itself. What its frames share with all others is known before:
+# calibration and weights, by which methods the flow is measured (from the first pair), and the tracers' size, for which
+# pairs are waited for until the first images show it. So the files are those of `run` once all pairs are there.
+
+PICTURE, PAGE = "latest.png", "latest.html"
+HEAD = ("first image", "tracers per microlens", "vectors", "u (m/s)", "v (m/s)", "w (m/s)", "verdict", "seconds")
+# Pairs that the page lists, and how often a browser reads it anew.
+LISTED, RELOAD_S = 30, 2
+UNKNOWN = "–"
+
+# Frames that are measured together: those of a pair, or of a file that holds several.
+Together = list[tuple[Frame, Frame]]
+
+
+def watch(
+    config: Path, settings: Config, output: Path, options: RunOptions, overwrite: bool, console: Console
+) -> dict[str, Any]:
+    """Calibrate, then measure each pair of folders that are still being filled when both images are there.
+
+    Once nothing has changed for the idle time, all that has come is taken through `run`, which tells of all.
+
+    Raises
+    ------
+    UsageError : something is made from all frames
+    PartialError : frames or pairs failed, or have no partner
+    """
+    options.ensure_one_by_one()
+    if options.follow or options.pairing == "sequence":
+        raise UsageError("--watch measures separate pairs (--pairing ab); run a sequence when all of it is there")
+    if options.dask:
+        raise UsageError("--dask: a pair is measured as it comes, one at a time; with --watch leave it out")
+    options = replace(options, keep_going=True, pairing=options.pairing if options.are_told else "ab")
+    run_choice.ensure_inputs(settings, replace(options, images=()))
+    come = watched(options.images, "images", options, options.idle_s, console)
+    atomic.ensure_writable(output / run_steps.RECORD, overwrite=True)
+    watching = Watching(config, settings, output, options, overwrite, console)
+    watching.weights()
+    left_out: list[Failure] = []
+    coming = (frames_of(files, keep_going=True) for files in come)
+    try:
+        for pairs in coming_pairs(coming, images_seen, options, console, left_out):
+            watching.take(pairs)
+        watching.take([], last=True)
+    finally:
+        console.say(f"{watching.count} pairs are done, in {output}; the same command goes on")
+    return watching.all_together(left_out)
+
+
+@dataclass
+class Watching:
+    """The pairs that have come so far, and what they share.
+
+    Attributes
+    ----------
+    count : pairs that are measured
+    """
+
+    config: Path
+    settings: Config
+    output: Path
+    options: RunOptions
+    overwrite: bool
+    console: Console
+    count: int = 0
+    _prepared: Prepared = field(default_factory=Prepared)
+    _choice: Choice | None = None
+    _every: Together = field(default_factory=list)
+    _waiting: Together = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        """Say what a pair's steps say in its line alone."""
+        self._quiet = replace(self.console, only_warnings=True)
+        self._latest = Latest(self.output, self.console, self.options.report)
+        self._weights = self.output / run_steps.WEIGHTS
+
+    def _chain(self, pairs: Together, console: Console, recorded: bool) -> Chain:
+        """Return the steps of some pairs."""
+        options, frames = self.options, [frame for pair in pairs for frame in pair]
+        earlier = run_steps.earlier_run(self.output, self.overwrite) if recorded else {}
+        steps = Steps(self.output, console, earlier, options.deadline(), recorded)
+        given = replace(options, images=list(dict.fromkeys(frame.path for frame in frames)))
+        two_by_two = Pairs(tuple((k, k + 1) for k in range(0, len(frames), 2)))
+        return Chain(self.config, self.settings, given, frames, two_by_two, steps, self.overwrite, self._prepared)
+
+    def weights(self) -> None:
+        """Calibrate, and build the weights."""
+        self._chain([], self.console, recorded=True).weights()
+
+    def take(self, pairs: Together, last: bool = False) -> None:
+        """Measure pairs; the first ones when the tracers' size is known, or no others are to come."""
+        self._every += pairs
+        self._waiting += pairs
+        if not self._waiting or not self._is_ready(last) or self._choice is None:
+            return
+        waiting, self._waiting = self._waiting, []
+        kept = 0
+        # Pages of one file belong to pairs that are measured together.
+        for _, those in groupby(waiting, key=lambda pair: {frame.path for frame in pair}):
+            kept += self._measure(list(those), self._choice)
+        if kept:
+            self.console.say(f"{kept} pairs are complete and kept")
+
+    def _is_ready(self, last: bool) -> bool:
+        """Return whether all that pairs share is known, once the first have shown it."""
+        chain = self._chain(self._waiting, self._quiet, recorded=False)
+        if self._choice is None:
+            try:
+                self._choice = run_choice.chosen(
+                    self.settings, self.options, lambda: run_choice.counted(chain, self._weights)
+                )
+            except InputError as error:
+                for pair in self._waiting:
+                    self._latest.failed(pair[0].path.name, str(error))
+                self._waiting = []
+                return False
+            self.console.say(f"by {' and '.join(self._choice.methods)}: {self._choice.reason}")
+            head = "velocities are means, ± the usual standard error of one vector"
+            self.console.answer(f"{', '.join(HEAD)}; {head}")
+        if "particles" not in self._choice.methods or self._prepared.size is not None:
+            return True
+        bench, read = run_choice.bench_and_reader(chain, self._weights)
+        numbers = range(min(len(chain.frames), LOOKED_AT))
+        seen = (particles.frame_of(bench, *each) for each in readable(read, numbers, keep_going=True))
+        found = particles.size_of(bench, seen)
+        if not (found.is_certain or len(chain.frames) >= LOOKED_AT or last):
+            self.console.say("too few tracers stand alone to tell their size: waits for the next pair")
+            return False
+        self._prepared.size = found
+        return True
+
+    def _measure(self, pairs: Together, choice: Choice) -> int:
+        """Take pairs through all steps, and tell of each; return how many were complete before."""
+        begun, name = time.monotonic(), pairs[0][0].path.name
+        chain = self._chain(pairs, self._quiet, recorded=False)
+        try:
+            fields = run_choice.measured(chain, choice, self._weights)
+        except InputError as error:
+            fields = {}
+            chain.failures = chain.failures or [Failure(name, str(error))]
+        if chain.failures:
+            self._latest.failed(name, chain.failures[0].error)
+        vectors = list(fields.values())[-1] if fields else {}
+        if not chain.steps.count(run_steps.MADE):
+            self.count += len(vectors)
+            return len(vectors)
+        by_rays = self.settings.weights.method != "dlfc"
+        tracers = run_choice.counted(chain, self._weights) if vectors and by_rays else None
+        seconds = time.monotonic() - begun
+        chain.steps.deadline.took(seconds)
+        for number, path in vectors.items():
+            files = [self.output / run_steps.CALIBRATION, self._weights, *chain.steps.files]
+            self._latest.measured(pairs[number][0].stem, tracers, files, path, seconds / len(pairs))
+            self.count += 1
+        return 0
+
+    def all_together(self, left_out: Sequence[Failure]) -> dict[str, Any]:
+        """Take all pairs through `run`, which finds them complete and tells of all."""
+        if not self._every:
+            raise InputError(f"{left_out[0].name}: {left_out[0].error}")
+        chain = self._chain(self._every, self._quiet, recorded=True)
+        chain.failures = list(left_out)
+        return run_choice.take_all(chain)
+
+
+@dataclass
+class Latest:
+    """What is shown of the pairs.
+
+    Attributes
+    ----------
+    output : the folder of the results
+    draws : whether the last pair is drawn, too
+    """
+
+    output: Path
+    console: Console
+    draws: bool
+    _rows: deque[tuple[str, ...]] = field(default_factory=lambda: deque(maxlen=LISTED))
+
+    def failed(self, name: str, error: str) -> None:
+        """Tell of a pair that could not be measured."""
+        self._tell(name, ((UNKNOWN,) * 5 + ("no", UNKNOWN)), f"failed: {error}", {"error": error})
+
+    def measured(
+        self, name: str, tracers_per_lens: float | None, made: Sequence[Path], vectors: Path, seconds: float
+    ) -> None:
+        """Tell of a pair whose files are `made`, and draw its vectors."""
+        contents = contents_of(self.output, made)
+        fields = {path: open_vectors(path) for path in contents.of("vectors")}
+        flow, parts = fields[vectors], judged(contents, fields)
+        mean, sigma = checks.velocity_of(flow)
+        verdict = checks.worst((line for lines in parts.values() for line in lines), "good")
+        cells = (
+            UNKNOWN if tracers_per_lens is None else written(tracers_per_lens, 2),
+            str(np.count_nonzero(flow.flag == VALID)),
+            *map(with_error, mean.tolist(), sigma.tolist()),
+            verdict,
+            f"{seconds:.1f}",
+        )
+        tracers, number, u, v, w, *_ = cells
+        line = f"{tracers} per microlens  {number} vectors  u {u}  v {v}  w {w} m/s  {verdict}  {seconds:.1f} s"
+        figures = {"velocity_m_s": mean.tolist(), "velocity_sigma_m_s": sigma.tolist(), "verdict": verdict}
+        self._tell(name, cells, line, figures | {"tracers_per_lens": tracers_per_lens, "seconds": seconds}, flow)
+
+    def _tell(
+        self, name: str, cells: tuple[str, ...], line: str, figures: Mapping[str, Any], flow: VectorField | None = None
+    ) -> None:
+        """Print a pair's line, add it to the log, and renew the page, with its picture where there is one."""
+        self.console.answer(f"{name}  {line}")
+        self.console.event("pair", name=name, **atomic.without_nan(dict(figures)))
+        if not self.draws:
+            return
+        self._rows.appendleft((name, *cells))
+        picture = self.output / PICTURE
+        if flow is not None:
+            write_picture(picture, planes_figure(flow), overwrite=True)
+        shown = (Picture(picture, "The last pair that was measured"),) if picture.exists() else ()
+        table = Table("The last one first", HEAD, tuple(self._rows))
+        foot = f"Renews itself every {RELOAD_S} s; velocities are means, ± the usual standard error of one vector."
+        sections = (Section("The last pair", "latest", pictures=shown), Section("Pairs", "pairs", tables=(table,)))
+        page = Page(f"{name}: {line.replace('  ', ', ')}", (), (), sections, foot, reload_s=RELOAD_S)
+        write_pages(page, [self.output / PAGE], overwrite=True)
 
 
 # Warming up is a small experiment, in which every step is taken once, so that all kernels are compiled.

@@ -16,7 +16,7 @@ from typing import Any
 
 from lfpiv_cli.console import Console
 from lfpiv_cli.errors import InputError, LfpivError, OutputExistsError, PartialError, StoppedEarlyError
-from lfpiv_cli.files.atomic import write_json
+from lfpiv_cli.files import atomic
 from lfpiv_cli.files.batch import VTKHDF_SUFFIX, Frame, Target
 from lfpiv_cli.files.config import Config
 from lfpiv_cli.files.pairing import Pairs
@@ -129,7 +129,7 @@ class Steps:
         for warning in (*recorded, *(notice.record() for notice in self.console.warned or ())):
             if warning not in reported["warnings"]:
                 reported["warnings"].append(warning)
-        write_json(self.output / RECORD, reported, overwrite=True)
+        atomic.write_json(self.output / RECORD, reported, overwrite=True)
 
 
 def earlier_run(output: Path, overwrite: bool) -> dict[str, Any]:
