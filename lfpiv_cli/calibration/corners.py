@@ -19,17 +19,11 @@ from numba import njit
 from numpy.typing import NDArray
 
 from lfpiv_cli.arrays import Floats, Integers, Singles
+from lfpiv_cli.calibration import views as of_views
 from lfpiv_cli.calibration.board_pose import BoardGeometry
 from lfpiv_cli.calibration.rectification import turned
 from lfpiv_cli.calibration.shape_fit import PointShape, ShapeFit, fit_shape, pixels_near, scene_points, scene_shares
-from lfpiv_cli.calibration.views import (
-    board_corners,
-    clear_mm,
-    described,
-    lens_table,
-    sub_aperture_view,
-    view_crossings,
-)
+from lfpiv_cli.calibration.views import clear_mm, described, lens_table
 from lfpiv_cli.calibration.wave_shapes import WaveLight, WaveShapes, corner_strips
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.notice import written
@@ -256,7 +250,7 @@ class CornerLook(Look):
 
         NaN where it does not. Views are followed from the main lens's middle outward.
         """
-        crossings = view_crossings(camera, RIM_PIXELS)
+        crossings = of_views.view_crossings(camera, RIM_PIXELS)
         crossings = crossings[np.argsort(np.hypot(crossings[:, 0], crossings[:, 1]), kind="stable")]
         grid, even = ViewGrid.of(camera), evenly_lit(self.signal, self.passed)
         clear = clear_mm(board) * abs(camera.magnification) / grid.step_mm
@@ -310,7 +304,7 @@ class ViewGrid:
 
 def upright_view(image: Floats, camera: Camera, grid: ViewGrid, crossing_mm: Floats) -> Floats:
     """Return the view from a point of the main lens on the upright samples of the grid."""
-    view = sub_aperture_view(image, camera, crossing_mm)
+    view = of_views.sub_aperture_view(image, camera, crossing_mm)
     at = grid.origin_mm[0] + np.arange(view.shape[1]) * grid.step_mm[0]
     return np.stack([np.interp(at, lenses[:, 0], row) for lenses, row in zip(grid.lenses_mm, view, strict=True)])
 
@@ -390,7 +384,7 @@ def first_corners(image: Singles, passed: Singles, camera: Camera, board: BoardG
                 "with larger ones"
             )
     picture, scale = enlarged_view(evenly_lit(image, passed), camera)
-    found = board_corners(picture, board)
+    found = of_views.board_corners(picture, board)
     if found is None:
         raise InputError(
             f"{described(board)} was not found in the picture; check board.pattern, board.squares, the exposure and "

@@ -14,16 +14,8 @@ from scipy import fft, ndimage
 from scipy.special import fdtrc
 
 from lfpiv_cli.arrays import Floats, Integers
-from lfpiv_cli.calibration.white import (
-    NARROWEST_LENS_IMAGE,
-    checked_white,
-    find_spots,
-    fit_vignetting,
-    index_spots,
-    lens_image_width,
-    relative_transmission,
-    vignetting_surface,
-)
+from lfpiv_cli.calibration import white as of_white
+from lfpiv_cli.calibration.white import find_spots, vignetting_surface
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.names import Layout
 from lfpiv_cli.neighbourhoods import largest_around
@@ -233,15 +225,15 @@ def fit_lattice(white: ArrayLike, dark: ArrayLike | None = None, layout: Layout 
     ------
     InputError : when the image is too dark, saturated or shows no lattice
     """
-    image = checked_white(white, dark)
+    image = of_white.checked_white(white, dark)
     fit = _lattice_of(image, layout)
 
     # Light that falls towards the corners pulls the centroids of lens images to the middle, in proportion to the image
     # height: as another pitch would.
     even = image.astype(np.float32)
-    if lens_image_width(even, fit.lattice_px) < NARROWEST_LENS_IMAGE:
+    if of_white.lens_image_width(even, fit.lattice_px) < of_white.NARROWEST_LENS_IMAGE:
         return fit
-    coefficients = fit_vignetting(relative_transmission(even, fit.lattice_px), fit.lattice_px)
+    coefficients = of_white.fit_vignetting(of_white.relative_transmission(even, fit.lattice_px), fit.lattice_px)
     if coefficients is None:
         return fit
     passed = vignetting_surface(coefficients, image.shape)
@@ -262,7 +254,7 @@ def _lattice_of(image: Floats, layout: Layout | None) -> LatticeFit:
     centre = (np.array(image.shape[::-1]) - 1.0) / 2.0
     best, indices = np.zeros(len(points), dtype=bool), np.zeros((len(points), 2), dtype=np.int64)
     for start in np.argsort(np.hypot(*(points - centre).T), kind="stable")[:STARTS]:
-        found, reached = index_spots(points, int(start), basis)
+        found, reached = of_white.index_spots(points, int(start), basis)
         if reached.sum() > best.sum():
             best, indices = reached, found
         if best.sum() >= REACHED_SHARE * len(points):

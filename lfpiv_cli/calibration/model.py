@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 from threadpoolctl import threadpool_limits
 
 from lfpiv_cli.arrays import Floats, Singles
+from lfpiv_cli.calibration import white as of_white
 from lfpiv_cli.calibration.board import locate_board
 from lfpiv_cli.calibration.board_pose import BoardGeometry, BoardPose
 from lfpiv_cli.calibration.dlfc import RayFit, fit_rays
@@ -22,14 +23,7 @@ from lfpiv_cli.calibration.light_checks import check_residual
 from lfpiv_cli.calibration.rectification import Rectification
 from lfpiv_cli.calibration.sheet import check_pitch, image_distance_mm, sheet_fit
 from lfpiv_cli.calibration.wave_shapes import WaveLight
-from lfpiv_cli.calibration.white import (
-    FULL_PERCENTILE,
-    NARROWEST_LENS_IMAGE,
-    by_aperture,
-    fit_vignetting,
-    lens_image_width,
-    relative_transmission,
-)
+from lfpiv_cli.calibration.white import NARROWEST_LENS_IMAGE
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.names import Layout
 from lfpiv_cli.optics.camera import Camera, refocused
@@ -152,7 +146,7 @@ class Calibration(Result):
         """Return the slow part of the transmission as coefficients; None where it was not measured."""
         if self.transmission is None:
             return None
-        return fit_vignetting(self.transmission, self.rectification.lattice_px)
+        return of_white.fit_vignetting(self.transmission, self.rectification.lattice_px)
 
     def summary(self) -> dict[str, Any]:
         """Return the figures as plain numbers and lists, units in their names; None where unknown."""
@@ -287,7 +281,7 @@ def lattice_calibration(pictures: Photographs, shape: tuple[int, int], sheet: Da
         if camera is None:
             raise InputError("without a white image the lattice needs the whole camera of the data sheet")
         return Calibration(Rectification(sheet_fit(camera), shape))
-    order = by_aperture(whites, dark)
+    order = of_white.by_aperture(whites, dark)
     fit = fit_lattice(whites[order[0]], dark, sheet.layout)
     if sheet.pitch_px is not None:
         check_pitch(fit, sheet.pitch_px)
@@ -296,9 +290,9 @@ def lattice_calibration(pictures: Photographs, shape: tuple[int, int], sheet: Da
     raw = pictures.less_dark(whites[order[-1]])
     image, lattice_px = rectification.apply(raw), rectification.lattice_px
     transmission, white = None, None
-    if lens_image_width(image, lattice_px) >= NARROWEST_LENS_IMAGE:
-        transmission = relative_transmission(image, lattice_px)
-        white = np.maximum(raw / np.percentile(raw, FULL_PERCENTILE), 0.0).astype(np.float32)
+    if of_white.lens_image_width(image, lattice_px) >= NARROWEST_LENS_IMAGE:
+        transmission = of_white.relative_transmission(image, lattice_px)
+        white = np.maximum(raw / np.percentile(raw, of_white.FULL_PERCENTILE), 0.0).astype(np.float32)
     distance, sigma = (None, None) if camera is None else image_distance_mm(fit, camera) or (None, None)
     return Calibration(
         rectification, transmission, image_distance_mm=distance, image_distance_sigma_mm=sigma, white=white

@@ -16,27 +16,11 @@ from typing import Any
 from lfpiv_cli.calibration.board_pose import BoardGeometry
 from lfpiv_cli.calibration.model import Calibration, Channel, Rig
 from lfpiv_cli.errors import ConfigError, InputError
+from lfpiv_cli.files import sections as of_rig
+from lfpiv_cli.files import sections_work as of_work
 from lfpiv_cli.files.checks import validated
-from lfpiv_cli.files.sections import (
-    UM_TO_MM,
-    BoardSection,
-    CameraSection,
-    ChannelSection,
-    MediaSection,
-    PipeSection,
-    VolumeSection,
-    scene_of,
-)
-from lfpiv_cli.files.sections_work import (
-    CorrelationSection,
-    FlowSection,
-    ReconstructionSection,
-    Sections,
-    SimulationSection,
-    ValidationSection,
-    WeightsSection,
-    flow_of,
-)
+from lfpiv_cli.files.sections import UM_TO_MM, PipeSection, scene_of
+from lfpiv_cli.files.sections_work import Sections, flow_of
 from lfpiv_cli.files.yaml_nodes import Document, read_rig
 from lfpiv_cli.flow.windows import CorrelationSettings, ParallelWalls, Walls
 from lfpiv_cli.grid import FOCAL_POINT, Grid, Reference
@@ -76,13 +60,13 @@ class Config:
 
     sections: Sections
     source: str
-    channel: ChannelSection | None = field(init=False)
+    channel: of_rig.ChannelSection | None = field(init=False)
     pipe: PipeSection | None = field(init=False)
-    weights: WeightsSection = field(init=False)
-    reconstruction: ReconstructionSection = field(init=False)
-    correlation: CorrelationSection = field(init=False)
-    simulation: SimulationSection = field(init=False)
-    validation: ValidationSection = field(init=False)
+    weights: of_work.WeightsSection = field(init=False)
+    reconstruction: of_work.ReconstructionSection = field(init=False)
+    correlation: of_work.CorrelationSection = field(init=False)
+    simulation: of_work.SimulationSection = field(init=False)
+    validation: of_work.ValidationSection = field(init=False)
 
     def __post_init__(self) -> None:
         """Take these out of the sections."""
@@ -125,22 +109,22 @@ class Config:
         )
 
     @property
-    def camera(self) -> CameraSection:
+    def camera(self) -> of_rig.CameraSection:
         """The section `camera`."""
         return self._needed("camera", self.sections.camera)
 
     @property
-    def media(self) -> MediaSection:
+    def media(self) -> of_rig.MediaSection:
         """The section `media`."""
         return self._needed("media", self.sections.media)
 
     @property
-    def volume(self) -> VolumeSection:
+    def volume(self) -> of_rig.VolumeSection:
         """The section `volume`."""
         return self._needed("volume", self.sections.volume)
 
     @property
-    def board(self) -> BoardSection:
+    def board(self) -> of_rig.BoardSection:
         """The section `board`."""
         return self._needed("board", self.sections.board)
 
@@ -367,7 +351,7 @@ class Config:
 
     def true_flow(self) -> Flow:
         """Return the flow to compare with, in the volume's coordinates: `validation.flow`, else the simulation's."""
-        flow: FlowSection | None = self.validation.flow or self.simulation.flow
+        flow: of_work.FlowSection | None = self.validation.flow or self.simulation.flow
         return flow_of(self._needed("validation.flow", flow), FOCAL_POINT)
 
     def flow_methods(self) -> tuple[str, ...]:

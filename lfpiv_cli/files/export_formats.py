@@ -14,29 +14,10 @@ from numpy.typing import NDArray
 
 from lfpiv_cli.errors import InputError, OutputError, UsageError
 from lfpiv_cli.files import export_vtk as vtk
+from lfpiv_cli.files import particle_file, vtkhdf
 from lfpiv_cli.files.hdf5 import format_of, open_h5
-from lfpiv_cli.files.particle_file import (
-    PARTICLES_FORMAT,
-    POSITION,
-    TRACKS_FORMAT,
-    TRAJECTORIES_FORMAT,
-    Points,
-    read_points,
-    units_of,
-)
-from lfpiv_cli.files.vtkhdf import (
-    FLAG_MEANINGS,
-    VECTORS_FORMAT,
-    VOLUME_FORMAT,
-    Volume,
-    arrays_of,
-    attributes_of,
-    grid_in,
-    open_vectors,
-    open_volume,
-    read_extra,
-    read_root,
-)
+from lfpiv_cli.files.particle_file import POSITION, TRAJECTORIES_FORMAT, Points
+from lfpiv_cli.files.vtkhdf import VECTORS_FORMAT, VOLUME_FORMAT, Volume
 from lfpiv_cli.flow.field import REJECTED, VectorField
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.names import ExportFormat
@@ -45,12 +26,12 @@ from lfpiv_cli.names import ExportFormat
 KINDS = {
     VOLUME_FORMAT: "a volume",
     VECTORS_FORMAT: "vectors",
-    PARTICLES_FORMAT: "particles",
-    TRACKS_FORMAT: "tracks of a pair",
+    particle_file.PARTICLES_FORMAT: "particles",
+    particle_file.TRACKS_FORMAT: "tracks of a pair",
     TRAJECTORIES_FORMAT: "tracks of a sequence",
 }
 ON_GRIDS = (VOLUME_FORMAT, VECTORS_FORMAT)
-OF_POINTS = (PARTICLES_FORMAT, TRACKS_FORMAT, TRAJECTORIES_FORMAT)
+OF_POINTS = (particle_file.PARTICLES_FORMAT, particle_file.TRACKS_FORMAT, TRAJECTORIES_FORMAT)
 # The last axis of an array, by its length: vectors, and symmetric tensors in VTK's order.
 COMPONENTS = {3: ("x", "y", "z"), 6: ("xx", "yy", "zz", "xy", "yz", "xz")}
 # What the components of these arrays are called; those of others have their name before them.
@@ -73,7 +54,7 @@ DESCRIPTIONS = {
     "correlation": "normalised correlation at the peak",
     "peak_ratio": "highest peak over the second",
     "valid_fraction": "share of the window inside volumes and mask",
-    "flag": FLAG_MEANINGS,
+    "flag": vtkhdf.FLAG_MEANINGS,
     "uncertainty_voxel": "standard deviation of the displacement",
     **{f"gradient_{name}": f"gradient of {name} along x, y, z" for name in "uvw"},
     "samples": "vectors or tracks that the moments are of",
@@ -113,7 +94,7 @@ class Content:
 
     def descriptions(self) -> dict[str, str]:
         """Return what each array holds, for people."""
-        other = {"flag": OUTSIDE} if self.format_name == PARTICLES_FORMAT else {}
+        other = {"flag": OUTSIDE} if self.format_name == particle_file.PARTICLES_FORMAT else {}
         return {name: (DESCRIPTIONS | other).get(name, name.replace("_", " ")) for name in self.arrays}
 
     def reported(self) -> dict[str, Any]:
@@ -138,17 +119,17 @@ def read_content(path: Path) -> Content:
     if name not in KINDS:
         raise InputError(f"{path}: holds {name}, expected {', '.join(KINDS)}")
     if name == VOLUME_FORMAT:
-        return content_of(open_volume(path))
+        return content_of(vtkhdf.open_volume(path))
     if name == VECTORS_FORMAT:
-        open_vectors(path)  # for its checks
-        found, _ = read_extra(path)
+        vtkhdf.open_vectors(path)  # for its checks
+        found, _ = vtkhdf.read_extra(path)
         # All arrays, those that commands store besides, too; the velocity first, as it is what is asked for.
         arrays = dict(sorted(found.items(), key=lambda each: (each[0] != "velocity", each[0])))
         with open_h5(path) as file:
-            grid, root = grid_in(file), read_root(file)
+            grid, root = vtkhdf.grid_in(file), vtkhdf.read_root(file)
             units = {each: file[each].attrs["units"].decode() for each in arrays}
         return Content(name, grid, arrays, units, root.attributes, root.provenance)
-    return content_of(read_points(path, name))
+    return content_of(particle_file.read_points(path, name))
 
 
 def content_of(
@@ -158,16 +139,16 @@ def content_of(
 ) -> Content:
     """Return what the file of a result holds; of vectors with arrays (units second) and attributes besides."""
     if isinstance(result, VectorField):
-        both = arrays_of(result) | dict(extra)
+        both = vtkhdf.arrays_of(result) | dict(extra)
         arrays = {name: array for name, (array, _) in both.items()}
         units = {name: unit for name, (_, unit) in both.items()}
-        said = result.reference.attributes() | attributes_of(result) | dict(attributes)
+        said = result.reference.attributes() | vtkhdf.attributes_of(result) | dict(attributes)
         said = {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in said.items()}
         return Content(VECTORS_FORMAT, result.grid, arrays, units, said, result.provenance)
     said = result.reference.attributes() | result.attributes
     if isinstance(result, Points):
         arrays = {POSITION: result.position_mm, **result.arrays}
-        units = {POSITION: "mm", **units_of(result.format_name, arrays)}
+        units = {POSITION: "mm", **particle_file.units_of(result.format_name, arrays)}
         return Content(result.format_name, None, arrays, units, said, result.provenance)
     return Content(VOLUME_FORMAT, result.grid, {"intensity": result.array}, {"intensity": "1"}, said, result.provenance)
 

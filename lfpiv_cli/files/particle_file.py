@@ -23,15 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lfpiv_cli.errors import InputError, OutputError
-from lfpiv_cli.files.hdf5 import (
-    array_member,
-    created,
-    format_of,
-    open_h5,
-    read_array,
-    write_array,
-    write_rows,
-)
+from lfpiv_cli.files import hdf5
+from lfpiv_cli.files.hdf5 import write_array, write_rows
 from lfpiv_cli.files.inputs import reason
 from lfpiv_cli.files.vtkhdf import create_vtk_group, mark_active, read_root, write_root
 from lfpiv_cli.grid import Reference
@@ -272,7 +265,7 @@ def write_points(path: Path, format_name: str, points: PointRows, *, overwrite: 
                 for begin in range(0, len(dataset), CHECKED_ROWS):
                     _ensure_finite(temporary, name, dataset[begin : begin + CHECKED_ROWS], len(dataset))
 
-    with created(path, overwrite=overwrite, check=check) as file:
+    with hdf5.created(path, overwrite=overwrite, check=check) as file:
         write_root(file, format_name, FORMAT_VERSION, points.reference, points.attributes, points.provenance)
         vtk = create_vtk_group(file, None)
         vtk["Points"] = write_rows(file, POSITION, points.count, points.rows(POSITION), "mm")
@@ -310,7 +303,7 @@ def read_points(path: Path | str, format_name: str) -> Points:
     path = Path(path)
     with _opened(path, format_name) as (file, datasets):
         size = path.stat().st_size
-        arrays = {name: read_array(dataset, size) for name, dataset in datasets.items()}
+        arrays = {name: hdf5.read_array(dataset, size) for name, dataset in datasets.items()}
         root = read_root(file)
     for name, array in arrays.items():
         _ensure_finite(path, name, array, len(array))
@@ -321,9 +314,9 @@ def read_points(path: Path | str, format_name: str) -> Points:
 @contextmanager
 def _opened(path: Path, format_name: str) -> Iterator[tuple[h5py.File, dict[str, h5py.Dataset]]]:
     """Open a file of points; its arrays, positions first, have as many rows each."""
-    with open_h5(path, format_name, FORMAT_VERSION) as file:
+    with hdf5.open_h5(path, format_name, FORMAT_VERSION) as file:
         names = [POSITION, *units_of(format_name, file)]
-        datasets = {name: array_member(file, name) for name in names}
+        datasets = {name: hdf5.array_member(file, name) for name in names}
         shape = datasets[POSITION].shape
         if len(shape) != 2 or shape[1] != 3:
             raise InputError(f"{path}: its positions have the shape {shape}, expected (n, 3)")
@@ -369,7 +362,7 @@ def open_tracks(path: Path | str) -> Points:
     InputError
         The file is missing, broken, or of another format or version.
     """
-    is_sequence = format_of(Path(path)) == TRAJECTORIES_FORMAT
+    is_sequence = hdf5.format_of(Path(path)) == TRAJECTORIES_FORMAT
     return read_points(path, TRAJECTORIES_FORMAT if is_sequence else TRACKS_FORMAT)
 
 

@@ -23,22 +23,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lfpiv_cli.errors import InputError, UsageError
+from lfpiv_cli.files import recording as recordings
 from lfpiv_cli.files.inputs import content_of, ensure_regular_file, opened, reading_from, reason
-from lfpiv_cli.files.recording import (
-    COLOUR_HINT,
-    CUT,
-    PACKED_BITS,
-    Image,
-    Pixels,
-    Recording,
-    Shape,
-    as_counts,
-    at_rate,
-    bytes_at,
-    ensure_size,
-    recording,
-    values_at,
-)
+from lfpiv_cli.files.recording import CUT, Image, Pixels, Recording, Shape, ensure_size, values_at
 
 # Photron's .mraw: frames one after the other, and a header in a file beside it, .cihx (XML) or .cih (text).
 
@@ -53,7 +40,7 @@ NAMES = {
     "rate": ("Record Rate(fps)", "recordInfo/recordRate"),
     "step": ("Save Step", "frameInfo/skipFrame"),
 }
-STORED_BITS = (8, 16, *PACKED_BITS)
+STORED_BITS = (8, 16, *recordings.PACKED_BITS)
 MONO = "mono"
 # A header has some thousand characters; one that is larger is none.
 MOST_HEADER_BYTES = 2**20
@@ -83,7 +70,7 @@ def mraw_frames(path: Path) -> Recording:
 
     colour = found.get("colour", MONO).lower()
     if colour != MONO:
-        raise InputError(f"{header}: describes {colour} images: {COLOUR_HINT}")
+        raise InputError(f"{header}: describes {colour} images: {recordings.COLOUR_HINT}")
     for name in ("pages", "columns", "rows", "bits"):
         text = found.get(name)
         if text is None or re.fullmatch(r"[1-9]\d{0,8}", text) is None:
@@ -91,13 +78,13 @@ def mraw_frames(path: Path) -> Recording:
     pages, columns, rows, bits = (int(found[name]) for name in ("pages", "columns", "rows", "bits"))
     if bits not in STORED_BITS:
         raise InputError(f"{header}: {NAMES['bits'][0]} is {bits}, expected one of {sorted(STORED_BITS)}")
-    pixels = Pixels((rows, columns), bits, "high-first" if bits in PACKED_BITS else "whole")
+    pixels = Pixels((rows, columns), bits, "high-first" if bits in recordings.PACKED_BITS else "whole")
     rate_hz = 0.0
     with suppress(ValueError, ZeroDivisionError):
         # The camera's, or one in so many where it left some out.
         rate_hz = float(found.get("rate", "0")) / float(found.get("step", "1"))
     places = range(0, pages * pixels.frame_bytes, pixels.frame_bytes)
-    return recording(path, places, pixels, at_rate(pages, rate_hz))
+    return recordings.recording(path, places, pixels, recordings.at_rate(pages, rate_hz))
 
 
 def header_beside(path: Path) -> tuple[Path, ...]:
@@ -136,7 +123,9 @@ def seq_frames(path: Path) -> Recording:
             raise InputError(f"{path}: its frames are compressed (kind {compression}): save it without compression")
         if kind != MONOCHROME:
             what = "raw Bayer" if kind == RAW_BAYER else f"of kind {kind}"
-            raise InputError(f"{path}: its frames are {what}, expected monochrome ({MONOCHROME}): {COLOUR_HINT}")
+            raise InputError(
+                f"{path}: its frames are {what}, expected monochrome ({MONOCHROME}): {recordings.COLOUR_HINT}"
+            )
         if stored not in (8, 16) or not 0 < used <= stored:
             raise InputError(f"{path}: has {used} bits in {stored} a pixel, expected them in 8 or 16")
         ensure_size(f"{path}: a frame", (rows, columns), stored // 8, None, path.stat().st_size)
@@ -148,7 +137,7 @@ def seq_frames(path: Path) -> Recording:
             )
         first = LONG_HEADER if version >= LONG_HEADER_VERSION else SHORT_HEADER
         places = range(first, first + pages * step, step)
-        found, size = recording(path, places, pixels), file.seek(0, 2)
+        found, size = recordings.recording(path, places, pixels), file.seek(0, 2)
         stamps = np.empty(len(places), TIME)
         for page, place in enumerate(places):
             if place + frame_bytes + TIME.itemsize > size:
@@ -197,11 +186,11 @@ def cine_frames(path: Path) -> Recording:
             )
         (filters,) = values_at(path, file, setup_at + FILTERS_AT, "<I")
         if compression == NOT_INTERPOLATED and filters:
-            raise InputError(f"{path}: holds {COLOUR_HINT}")
+            raise InputError(f"{path}: holds {recordings.COLOUR_HINT}")
         kind = np.dtype("<i8" if version else "<u4")
         if not pages:
             raise InputError(f"{path}: it holds no frames")
-        places = np.frombuffer(bytes_at(path, file, places_at, pages * kind.itemsize), kind).astype(np.int64)
+        places = np.frombuffer(recordings.bytes_at(path, file, places_at, pages * kind.itemsize), kind).astype(np.int64)
         pixels, used = _pixels(path, file, bitmap_at, setup_at)
         ensure_size(f"{path}: a frame", pixels.shape, 1, None, path.stat().st_size)
         times = _times(path, file, setup_at, places_at, pages)
@@ -217,7 +206,7 @@ def cine_frames(path: Path) -> Recording:
             )
         return place + notes_bytes
 
-    found = recording(path, places, pixels, begin=begin)
+    found = recordings.recording(path, places, pixels, begin=begin)
     return Recording(pages, found.shape, used, found.read_page, times)
 
 
@@ -252,7 +241,7 @@ def _pixels(path: Path, file: BinaryIO, bitmap_at: int, setup_at: int) -> tuple[
         tight = Pixels(shape, stored, bottom_up=height > 0)
         pixels = padded if frame_bytes == padded.frame_bytes else tight
     else:
-        raise InputError(f"{path}: has {stored} bits a pixel, packed by kind {packing}: {COLOUR_HINT}")
+        raise InputError(f"{path}: has {stored} bits a pixel, packed by kind {packing}: {recordings.COLOUR_HINT}")
     if frame_bytes != pixels.frame_bytes:
         raise InputError(f"{path}: declares {frame_bytes} bytes a frame, expected {pixels.frame_bytes}")
     return pixels, used if 0 < used <= pixels.bits or packing == PACKED_10 else pixels.bits
@@ -267,14 +256,14 @@ def _times(path: Path, file: BinaryIO, setup_at: int, places_at: int, pages: int
             break
         block_bytes, kind, _ = values_at(path, file, place, BLOCK)
         if kind == TIMES:
-            ticks = np.frombuffer(bytes_at(path, file, place + BLOCK_BYTES, 8 * pages), "<u8")
+            ticks = np.frombuffer(recordings.bytes_at(path, file, place + BLOCK_BYTES, 8 * pages), "<u8")
             exact = ticks >> np.uint64(FLAG_BITS)
             return (exact.astype(np.int64) - int(exact[0])) / TICKS_PER_S
         if block_bytes < BLOCK_BYTES:
             break
         place += block_bytes
     (rate_hz,) = values_at(path, file, setup_at + RATE_AT, "<I")
-    return at_rate(pages, rate_hz)
+    return recordings.at_rate(pages, rate_hz)
 
 
 # LaVision DaVis' .im7: the frames of one recording, one below the other, as they are or packed by zlib.
@@ -318,11 +307,11 @@ def im7_frames(path: Path) -> Recording:
         with opened(path) as file:
             ensure_size(f"{path}: frame {page}", declared, 1, shape, file.seek(0, 2))
             if packing == NOT_PACKED:
-                data = bytes_at(path, file, IM7_HEADER_BYTES + page * frame_bytes, frame_bytes)
+                data = recordings.bytes_at(path, file, IM7_HEADER_BYTES + page * frame_bytes, frame_bytes)
             else:
                 # All frames, whose check sum tells damage: one byte more than there should be shows that it is there.
                 (length,) = values_at(path, file, IM7_HEADER_BYTES, PACKED_LENGTH)
-                packed = bytes_at(path, file, IM7_HEADER_BYTES + PACKED_LENGTH_BYTES, length)
+                packed = recordings.bytes_at(path, file, IM7_HEADER_BYTES + PACKED_LENGTH_BYTES, length)
                 unpacking = zlib.decompressobj()
                 try:
                     whole = unpacking.decompress(packed, pages * frame_bytes + 1)
@@ -331,7 +320,7 @@ def im7_frames(path: Path) -> Recording:
                 if len(whole) != pages * frame_bytes or not unpacking.eof:
                     raise InputError(f"{path}: does not unpack to {pages} frames of {frame_bytes} bytes: {CUT}")
                 data = whole[page * frame_bytes : (page + 1) * frame_bytes]
-        return as_counts(np.frombuffer(data, counts).reshape(declared))
+        return recordings.as_counts(np.frombuffer(data, counts).reshape(declared))
 
     return Recording(pages, declared, 8 * counts.itemsize, read_page)
 

@@ -22,20 +22,10 @@ import numpy as np
 import tifffile
 
 from lfpiv_cli.errors import InputError, LfpivError
+from lfpiv_cli.files import recording as recordings
 from lfpiv_cli.files.hdf5 import items_in, member, open_h5
 from lfpiv_cli.files.inputs import reason
-from lfpiv_cli.files.recording import (
-    CUT,
-    GREY_HINT,
-    HARMLESS_BYTES,
-    Image,
-    Recording,
-    Shape,
-    as_counts,
-    ensure_size,
-    one_channel,
-    reading,
-)
+from lfpiv_cli.files.recording import CUT, GREY_HINT, Image, Recording, Shape, as_counts, ensure_size
 
 # Greyscale PNG: one frame a file.
 
@@ -64,7 +54,7 @@ def _read_png(path: Path, page: int, shape: Shape | None) -> Image:
     with _naming(path):
         declared, size = png_frames(path).shape, path.stat().st_size
         ensure_size("the image", declared, 1, shape, size)
-        if size > HARMLESS_BYTES + MOST_BYTES_A_PIXEL * math.prod(declared):
+        if size > recordings.HARMLESS_BYTES + MOST_BYTES_A_PIXEL * math.prod(declared):
             raise InputError(f"has {size} bytes, more than a PNG of {declared[1]} x {declared[0]} pixels takes: {CUT}")
         content = path.read_bytes()
         parts = list(_parts(content))
@@ -87,7 +77,7 @@ def _read_png(path: Path, page: int, shape: Shape | None) -> Image:
         array = imagecodecs.png_decode(content)
         if array.shape[:2] != (rows, columns):
             raise InputError(f"decodes to {array.shape}, it declares {rows, columns}")
-        return as_counts(one_channel(array, "the image"))
+        return as_counts(recordings.one_channel(array, "the image"))
 
 
 def _parts(content: bytes) -> Iterator[tuple[bytes, bytes]]:
@@ -248,7 +238,7 @@ def _read_tiff(path: Path, places: Sequence[int], number: int, shape: Shape | No
             raise InputError(f"page {number} decodes to {array.shape}, it declares {declared}")
         if page.colormap is not None:
             array = np.moveaxis(page.colormap[:, array] >> PALETTE_SHIFT, 0, -1)
-        return as_counts(one_channel(array, f"page {number}"))
+        return as_counts(recordings.one_channel(array, f"page {number}"))
 
 
 @contextmanager
@@ -257,7 +247,7 @@ def _naming(path: Path) -> Iterator[None]:
 
     A damaged file can raise anything inside the decoders, so anything becomes an `InputError`.
     """
-    token = reading.set(path)
+    token = recordings.reading.set(path)
     try:
         yield
     except LfpivError as error:
@@ -265,7 +255,7 @@ def _naming(path: Path) -> Iterator[None]:
     except Exception as error:
         raise InputError(f"{path}: cannot be decoded: {reason(error)}") from error
     finally:
-        reading.reset(token)
+        recordings.reading.reset(token)
 
 
 def _ensure_segments(page: tifffile.TiffPage, number: int, file_bytes: int) -> None:
@@ -285,7 +275,7 @@ def _ensure_segments(page: tifffile.TiffPage, number: int, file_bytes: int) -> N
             rows = min(rows, page.imagelength - segment % -(-page.imagelength // rows) * rows)
         # Where it is not packed; each of its rows takes whole bytes.
         pixels = rows * -(-columns * math.prod(samples) * page.bitspersample // 8)
-        least, most = pixels if page.compression == NOT_PACKED else 1, HARMLESS_BYTES + 2 * pixels
+        least, most = pixels if page.compression == NOT_PACKED else 1, recordings.HARMLESS_BYTES + 2 * pixels
         if not least <= length <= most:
             raise InputError(
                 f"strip or tile {segment} of page {number} has {length} bytes, its pixels take {pixels}: {CUT}"

@@ -22,14 +22,8 @@ from lfpiv_cli.optics.camera import Camera, Lattice
 from lfpiv_cli.optics.line_responses import USUAL_DIFFUSION_PX
 from lfpiv_cli.optics.media import Media, Window, channel_window
 from lfpiv_cli.optics.tracing import LARGEST_ERROR_PX, refraction_error_mm
-from lfpiv_cli.validation.planning import (
-    BEST_PER_LENS,
-    depth_of_field_mm,
-    half_view_mm,
-    proposed_window_mm,
-    time_step_s,
-    tracers_in,
-)
+from lfpiv_cli.validation import planning
+from lfpiv_cli.validation.planning import half_view_mm
 
 # A configuration as text: a short YAML file with a comment on each key that a newcomer meets, and its JSON schema.
 
@@ -192,7 +186,7 @@ class RigNumbers:
         camera, media = filled.camera(), filled.media()
         depth = self.channel_mm or min(
             DEPTHS_IN_VOLUME * camera.scale(media).depth_mm,
-            2.0 * depth_of_field_mm(camera, media),
+            2.0 * planning.depth_of_field_mm(camera, media),
             SHARE_OF_DISTANCE * camera.focus_distance_mm * self.fluid,
         )
         half = half_view_mm(camera, media, [-0.5 * depth, 0.5 * depth]).min(axis=0)
@@ -238,7 +232,7 @@ def tree_of(numbers: RigNumbers) -> dict[str, Any]:
     camera, media = known.camera(), known.media()
     scale = camera.scale(media)
     overlap = CorrelationSection().overlap
-    window_mm = [float(side) for side in proposed_window_mm(camera, media, size, overlap)]
+    window_mm = [float(side) for side in planning.proposed_window_mm(camera, media, size, overlap)]
     tree: dict[str, Any] = {
         "camera": {
             "main_lens": {
@@ -269,7 +263,7 @@ def tree_of(numbers: RigNumbers) -> dict[str, Any]:
     if known.wavelength_nm is not None:
         tree["reconstruction"] = {"wavelength_nm": known.wavelength_nm}
     voxel_mm = scale.lens_mm / LATERAL_VOXELS_PER_MICROLENS
-    tree["correlation"] = {"window_mm": window_mm, "dt_s": _rounded(time_step_s(known.velocity_m_s, voxel_mm))}
+    tree["correlation"] = {"window_mm": window_mm, "dt_s": _rounded(planning.time_step_s(known.velocity_m_s, voxel_mm))}
     tree["simulation"] = {
         "flow": {
             "kind": "shear",
@@ -278,7 +272,7 @@ def tree_of(numbers: RigNumbers) -> dict[str, Any]:
             "rate_per_s": _rounded(1e3 * known.velocity_m_s / size[2]),
             "velocity_m_s": [known.velocity_m_s, 0.0, 0.0],
         },
-        "particles": round(tracers_in(camera, BEST_PER_LENS, size)),
+        "particles": round(planning.tracers_in(camera, planning.BEST_PER_LENS, size)),
     }
     if known.wavelength_nm is not None:
         tree["camera"]["sensor"]["diffusion_px"] = USUAL_DIFFUSION_PX

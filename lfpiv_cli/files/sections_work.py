@@ -9,47 +9,12 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Union, get_type_hints
 
 from pydantic import Field, create_model
 
+from lfpiv_cli import names
 from lfpiv_cli.calibration.wave_shapes import WaveLight
-from lfpiv_cli.files.sections import (
-    MOST_BUBBLES,
-    MOST_FRAMES,
-    MOST_PARTICLES,
-    NM_TO_MM,
-    Angle,
-    BoardSection,
-    CameraSection,
-    ChannelSection,
-    Diffusion,
-    FaceSection,
-    MediaSection,
-    NotNegative,
-    Overlaps,
-    Pair,
-    PerAxis,
-    PipeAxis,
-    PipeSection,
-    Positive,
-    Section,
-    Share,
-    Vector,
-    VolumeSection,
-    Wavelength,
-    Windows,
-    WindowSection,
-)
+from lfpiv_cli.files import sections as of_rig
+from lfpiv_cli.files.sections import NM_TO_MM, Diffusion, NotNegative, Pair, Positive, Section, Share, Vector
 from lfpiv_cli.grid import Reference
-from lfpiv_cli.names import (
-    BoardImages,
-    BoardMethod,
-    BubbleWall,
-    FlowMethod,
-    Mask,
-    Method,
-    Refraction,
-    Sampling,
-    Start,
-    Weighting,
-)
+from lfpiv_cli.names import Refraction
 from lfpiv_cli.optics.line_responses import USUAL_DIFFUSION_PX
 from lfpiv_cli.optics.waves import Waves
 from lfpiv_cli.reconstruction.registry import SolverName
@@ -71,9 +36,9 @@ class WeightsSection(Section):
     count of rays_per_point rays from each of `points` random points of a voxel (rays), seeded; for small volumes only.
     """
 
-    method: Method = "ert"
+    method: names.Method = "ert"
     refraction: Refraction = "paraxial"
-    sampling: Sampling = "exact"
+    sampling: names.Sampling = "exact"
     points: Annotated[int, Field(ge=1, le=10_000_000)] = 500
     rays_per_point: Annotated[int, Field(ge=1, le=10_000_000)] = 10_000
     seed: Annotated[int, Field(ge=0)] = 0
@@ -98,13 +63,13 @@ class ReconstructionSection(Section):
     """
 
     solver: SolverName = "em"
-    start: Start = "uniform"
+    start: names.Start = "uniform"
     stop_change: Annotated[float, Field(gt=0.0, lt=1.0)] | None = None
     stop_noise: Positive | None = None
     photons_per_count: Positive | None = None
     saturation_counts: Positive | None = None
     particle_diameter_mm: Positive | None = None
-    wavelength_nm: Wavelength | None = None
+    wavelength_nm: of_rig.Wavelength | None = None
     diffusion_px: Diffusion | None = None
     iterations: Annotated[int, Field(ge=1, le=100_000)] = 24
     relaxation: Annotated[float, Field(gt=0.0, le=2.0)] = 1.0
@@ -134,13 +99,13 @@ class CorrelationSection(Section):
     weighting: uniform counts all voxels of a window alike, gaussian those near its middle more.
     """
 
-    windows: Windows | None = None
-    window_mm: PerAxis | None = None
-    overlap: Overlaps = (0.5, 0.5, 0.5)
+    windows: of_rig.Windows | None = None
+    window_mm: of_rig.PerAxis | None = None
+    overlap: of_rig.Overlaps = (0.5, 0.5, 0.5)
     dt_s: Positive | None = None
-    mask: Mask | None = None
+    mask: names.Mask | None = None
     exponent: Annotated[float, Field(gt=0.0, le=1.0)] | None = None
-    weighting: Weighting = "uniform"
+    weighting: names.Weighting = "uniform"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -150,7 +115,7 @@ class CorrelationKeys:
     dt_s: float | None = None
     windows: Sequence[int | Sequence[int]] | None = None
     overlap: float | Sequence[float] | None = None
-    weighting: Weighting | None = None
+    weighting: names.Weighting | None = None
 
 
 # What a flow's parameter may be, by its name; by its type in the factory's signature. Lengths are positive.
@@ -159,7 +124,7 @@ OF_FLOWS: dict[str, Any] = {
     "modes": Annotated[int, Field(ge=1, le=MOST_MODES)],
     "seed": Annotated[int, Field(ge=0)],
 }
-OF_TYPES: dict[Any, Any] = {Sequence[float]: Vector, Literal["x", "y"] | Sequence[float]: PipeAxis}
+OF_TYPES: dict[Any, Any] = {Sequence[float]: Vector, Literal["x", "y"] | Sequence[float]: of_rig.PipeAxis}
 
 
 def flow_section(factory: Callable[..., Flow]) -> type[Section]:
@@ -219,7 +184,7 @@ class WavesSection(Section):
     """
 
     kind: Literal["waves"]
-    wavelength_nm: Wavelength = 532.0
+    wavelength_nm: of_rig.Wavelength = 532.0
     points: Annotated[int, Field(ge=3, le=1000)] = 16
 
     def waves(self) -> Waves | None:
@@ -241,7 +206,7 @@ class ObjectiveSection(Section):
     falloff: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.0
     field_curvature_mm: float = 0.0
     astigmatism_mm: float = 0.0
-    array_tilt_deg: tuple[Angle, Angle] = (0.0, 0.0)
+    array_tilt_deg: tuple[of_rig.Angle, of_rig.Angle] = (0.0, 0.0)
 
 
 LightSection = Annotated[RaysSection | WavesSection, Field(discriminator="kind")]
@@ -272,10 +237,10 @@ class SimulationSection(Section):
     """
 
     flow: FlowSection | None = None
-    frames: Annotated[int, Field(ge=2, le=MOST_FRAMES)] = 2
+    frames: Annotated[int, Field(ge=2, le=of_rig.MOST_FRAMES)] = 2
     pulsation: PulsationSection | None = None
     light_z_mm: Pair | None = None
-    particles: Annotated[int, Field(ge=0, le=MOST_PARTICLES)] = 1000
+    particles: Annotated[int, Field(ge=0, le=of_rig.MOST_PARTICLES)] = 1000
     particle_diameter_mm: NotNegative = 0.05
     particle_diameter_log_sigma: NotNegative = 0.0
     brightness: tuple[NotNegative, NotNegative] = (0.6, 1.4)
@@ -283,15 +248,15 @@ class SimulationSection(Section):
     brightness_flicker: NotNegative = 0.0
     particle_counts: Positive = 500_000.0
     mid_plane_z_mm: float | None = None
-    bubbles: Annotated[int, Field(ge=0, le=MOST_BUBBLES)] = 0
+    bubbles: Annotated[int, Field(ge=0, le=of_rig.MOST_BUBBLES)] = 0
     bubble_diameter_mm: tuple[Positive, Positive] = (0.3, 0.8)
     bubble_counts: Positive = 200_000.0
-    bubble_wall: BubbleWall = "high"
+    bubble_wall: names.BubbleWall = "high"
     board_z_mm: float = 0.0
-    board_tilt_deg: tuple[Angle, Angle] = (0.0, 0.0)
+    board_tilt_deg: tuple[of_rig.Angle, of_rig.Angle] = (0.0, 0.0)
     board_offset_mm: Pair = (0.0, 0.0)
-    board_rotation_deg: Angle = 0.0
-    rotation_deg: Angle = 0.0
+    board_rotation_deg: of_rig.Angle = 0.0
+    rotation_deg: of_rig.Angle = 0.0
     shift_px: Pair = (0.0, 0.0)
     distortion_per_mm2: float = 0.0
     objective: ObjectiveSection = ObjectiveSection()
@@ -365,8 +330,8 @@ class BoardValidation(Section):
     points (ert) and rays fitted to the boards (dlfc); or no weights, the dots fitted to the pictures as discs (discs).
     """
 
-    images: BoardImages = "ideal"
-    methods: Annotated[tuple[BoardMethod, ...], Field(min_length=1)] = ("ert",)
+    images: names.BoardImages = "ideal"
+    methods: Annotated[tuple[names.BoardMethod, ...], Field(min_length=1)] = ("ert",)
 
 
 class ValidationSection(Section):
@@ -378,7 +343,7 @@ class ValidationSection(Section):
     """
 
     flow: FlowSection | None = None
-    flow_methods: Annotated[tuple[FlowMethod, ...], Field(min_length=1)] | None = None
+    flow_methods: Annotated[tuple[names.FlowMethod, ...], Field(min_length=1)] | None = None
     limits: Limits = Limits()
     weights: WeightsValidation = WeightsValidation()
     board: BoardValidation = BoardValidation()
@@ -387,14 +352,14 @@ class ValidationSection(Section):
 class Sections(Section):
     """The whole configuration as it stands in the file; `files.config.Config` says what is missing."""
 
-    camera: CameraSection | None = None
-    media: MediaSection | None = None
-    window: WindowSection | None = None
-    scene: Annotated[tuple[FaceSection, ...], Field(min_length=1)] | None = None
-    volume: VolumeSection | None = None
-    board: BoardSection | None = None
-    channel: ChannelSection | None = None
-    pipe: PipeSection | None = None
+    camera: of_rig.CameraSection | None = None
+    media: of_rig.MediaSection | None = None
+    window: of_rig.WindowSection | None = None
+    scene: Annotated[tuple[of_rig.FaceSection, ...], Field(min_length=1)] | None = None
+    volume: of_rig.VolumeSection | None = None
+    board: of_rig.BoardSection | None = None
+    channel: of_rig.ChannelSection | None = None
+    pipe: of_rig.PipeSection | None = None
     weights: WeightsSection = WeightsSection()
     reconstruction: ReconstructionSection = ReconstructionSection()
     correlation: CorrelationSection = CorrelationSection()

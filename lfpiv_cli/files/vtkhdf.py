@@ -17,19 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lfpiv_cli.errors import InputError
-from lfpiv_cli.files.hdf5 import (
-    RESERVED,
-    array_member,
-    created,
-    from_attribute,
-    member,
-    open_h5,
-    read_array,
-    read_provenance,
-    to_attribute,
-    write_array,
-    write_header,
-)
+from lfpiv_cli.files import hdf5
+from lfpiv_cli.files.hdf5 import RESERVED, created, open_h5, write_array
 from lfpiv_cli.flow.field import REJECTED, VectorField
 from lfpiv_cli.grid import Grid, Reference
 from lfpiv_cli.results import ArrayResult
@@ -98,14 +87,14 @@ def write_root(
 
     What is None is not said, as netCDF knows no empty attribute.
     """
-    write_header(file, format_name, format_version, provenance)
+    hdf5.write_header(file, format_name, format_version, provenance)
     for name, value in (reference.attributes() | dict(attributes)).items():
         if name in RESERVED:
             raise ValueError(f"{name} is a name that every file uses for itself")
         if isinstance(value, (np.ndarray, list)):
             file.attrs[name] = np.asarray(value)
         elif value is not None:
-            file.attrs[name] = to_attribute(value)
+            file.attrs[name] = hdf5.to_attribute(value)
 
 
 def read_root(file: h5py.File) -> Header:
@@ -116,11 +105,11 @@ def read_root(file: h5py.File) -> Header:
     KeyError, ValueError : it does not say where its coordinates begin, or how it was made
     """
     attributes = {
-        name: value.tolist() if isinstance(value, np.ndarray) else from_attribute(name, value)
+        name: value.tolist() if isinstance(value, np.ndarray) else hdf5.from_attribute(name, value)
         for name, value in file.attrs.items()
         if name not in RESERVED
     }
-    return Header(Reference.from_attributes(attributes), attributes, read_provenance(file))
+    return Header(Reference.from_attributes(attributes), attributes, hdf5.read_provenance(file))
 
 
 VOLUME_FORMAT = "lfpiv-volume"
@@ -292,11 +281,12 @@ def read_extra(path: Path) -> tuple[dict[str, NDArray[Any]], dict[str, dict[str,
     with open_h5(path, VECTORS_FORMAT, FORMAT_VERSION) as file:
         size, grid = path.stat().st_size, grid_in(file)
         places = 2 if grid.shape_zyx[0] == 1 else 3
-        names = list(member(member(file, "VTKHDF"), "PointData"))
-        arrays = read_on_grid(path, file, grid, {name: array_member(file, name).ndim > places for name in names})
-        groups = [name for name in file if name != "VTKHDF" and isinstance(member(file, name), h5py.Group)]
+        names = list(hdf5.member(hdf5.member(file, "VTKHDF"), "PointData"))
+        arrays = read_on_grid(path, file, grid, {name: hdf5.array_member(file, name).ndim > places for name in names})
+        groups = [name for name in file if name != "VTKHDF" and isinstance(hdf5.member(file, name), h5py.Group)]
         tables = {
-            name: {each: read_array(array_member(file[name], each), size) for each in file[name]} for name in groups
+            name: {each: hdf5.read_array(hdf5.array_member(file[name], each), size) for each in file[name]}
+            for name in groups
         }
     return arrays, tables
 
@@ -332,7 +322,7 @@ def _write_on_grid(file: h5py.File, grid: Grid, arrays: Mapping[str, tuple[NDArr
 
 def grid_in(file: h5py.File) -> Grid:
     """Return the grid of an open file."""
-    vtk = member(file, "VTKHDF").attrs
+    vtk = hdf5.member(file, "VTKHDF").attrs
     extent = [int(v) for v in vtk["WholeExtent"]]
     spacing = [float(v) for v in vtk["Spacing"]]
     origin = [float(v) for v in vtk["Origin"]]
@@ -355,8 +345,8 @@ def read_on_grid(path: Path, file: h5py.File, grid: Grid, components: Mapping[st
     for name, with_components in components.items():
         shape = grid.shape_zyx + ((3,) if with_components else ())
         stored = shape[1:] if shape[0] == 1 else shape
-        dataset = array_member(file, name)
+        dataset = hdf5.array_member(file, name)
         if dataset.shape != stored:
             raise ValueError(f"{name} has the shape {dataset.shape}, its extent says {stored}")
-        found[name] = read_array(dataset, path.stat().st_size).reshape(shape)
+        found[name] = hdf5.read_array(dataset, path.stat().st_size).reshape(shape)
     return found

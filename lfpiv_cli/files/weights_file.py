@@ -31,28 +31,11 @@ from pydantic import Field, ValidationError
 from lfpiv_cli.calibration.model import Calibration
 from lfpiv_cli.calibration.white import vignetting_surface
 from lfpiv_cli.errors import InputError
-from lfpiv_cli.files import calibration_file
-from lfpiv_cli.files.checks import (
-    FEWEST_PIXELS_A_LENS,
-    LARGEST_NUMBER,
-    MOST_PIXELS_A_LENS,
-    SMALLEST_NUMBER,
-    lens_image_faults,
-)
+from lfpiv_cli.files import calibration_file, checks, sections
+from lfpiv_cli.files.checks import LARGEST_NUMBER, SMALLEST_NUMBER
 from lfpiv_cli.files.hdf5 import open_h5, read_provenance, read_tree, write_tree
 from lfpiv_cli.files.inputs import physical_memory
-from lfpiv_cli.files.sections import (
-    MOST_VOXELS_PER_SIDE,
-    FaceSection,
-    Index,
-    Pair,
-    Pixels,
-    Section,
-    Vector,
-    Voxels,
-    WindowSection,
-    scene_of,
-)
+from lfpiv_cli.files.sections import Index, Pair, Pixels, Section, Vector, Voxels, WindowSection, scene_of
 from lfpiv_cli.files.yaml_nodes import Document, problem_of
 from lfpiv_cli.grid import Grid, Reference
 from lfpiv_cli.names import ColumnAxis, Layout, Refraction, TracedMethod
@@ -91,7 +74,7 @@ LEAST_SINE = 0.5
 
 # The camera, the grid and what rays cross, believed only as far as a config would be.
 Size = Annotated[float, Field(ge=SMALLEST_NUMBER)]
-Padding = Annotated[int, Field(ge=0, le=MOST_VOXELS_PER_SIDE)]
+Padding = Annotated[int, Field(ge=0, le=sections.MOST_VOXELS_PER_SIDE)]
 
 
 class StoredCamera(Section):
@@ -128,7 +111,7 @@ class StoredSpace(Section):
     air: Index
     window: Index
     fluid: Index
-    faces: tuple[FaceSection, ...] | None = None
+    faces: tuple[sections.FaceSection, ...] | None = None
     method: TracedMethod
     refraction: Refraction
     window_face: WindowSection | None = None
@@ -452,8 +435,8 @@ def _camera(reported: StoredCamera) -> Camera:
         raise ValueError(f"the lattice's basis {reported.lattice_basis_mm} is of no array of lenses")
     camera = Camera(lattice=lattice, **reported.model_dump(exclude={"layout", "lattice_origin_mm", "lattice_basis_mm"}))
     pitch_px = camera.lattice.pitch / camera.pixel_mm
-    if not (pitch_px.min() >= FEWEST_PIXELS_A_LENS and pitch_px.max() <= MOST_PIXELS_A_LENS):
+    if not (pitch_px.min() >= checks.FEWEST_PIXELS_A_LENS and pitch_px.max() <= checks.MOST_PIXELS_A_LENS):
         raise ValueError(f"its lens images are {pitch_px.tolist()} px apart")
-    for fault in lens_image_faults(camera):
+    for fault in checks.lens_image_faults(camera):
         raise ValueError(fault[1])
     return camera

@@ -18,25 +18,9 @@ import numpy as np
 
 from lfpiv_cli.files.pages import Table
 from lfpiv_cli.notice import written
+from lfpiv_cli.paper import small_rig
 from lfpiv_cli.paper.parts import Drawing, Findings, Row, Work
-from lfpiv_cli.paper.small_rig import (
-    GATE_MM,
-    HALF_DEPTH_MM,
-    READOUT,
-    Case,
-    Figures,
-    Image,
-    Points,
-    Rig,
-    displacement,
-    index_wrong,
-    lattice_shifted,
-    lattice_turned,
-    photograph,
-    sheet,
-    strewn_apart,
-    tracks_between,
-)
+from lfpiv_cli.paper.small_rig import HALF_DEPTH_MM, READOUT, Case, Figures, Image, Points
 from lfpiv_cli.particles.rounds import ROUNDS
 from lfpiv_cli.pictures.style import Figure, new_panels, styled
 from lfpiv_cli.validation.volume import fit_errors, pairs_of
@@ -139,16 +123,16 @@ class Fault:
 
 def good() -> Case:
     """Return the rig as it is."""
-    known = Rig(sheet())
+    known = small_rig.Rig(small_rig.sheet())
     return Case(known, known)
 
 
 NONE = Fault("none", good)
 FAULTS = (
-    Fault("index 1.30 for 1.33", partial(index_wrong, WRONG_INDEX)),
+    Fault("index 1.30 for 1.33", partial(small_rig.index_wrong, WRONG_INDEX)),
     Fault("z of the wrong sign", good, signs=(1.0, 1.0, -1.0)),
-    Fault("images half a pixel off", partial(lattice_shifted, SHIFT_PX)),
-    Fault("lattice turned by 0.02 degrees", partial(lattice_turned, TURN_DEG)),
+    Fault("images half a pixel off", partial(small_rig.lattice_shifted, SHIFT_PX)),
+    Fault("lattice turned by 0.02 degrees", partial(small_rig.lattice_turned, TURN_DEG)),
     Fault("column axis mirrored", good, lambda pair: (pair[0][:, ::-1].copy(), pair[1][:, ::-1].copy())),
     Fault("pair swapped", good, lambda pair: (pair[1], pair[0])),
 )
@@ -188,16 +172,16 @@ def measured(fault: Fault, seed: int) -> Figures:
     """Return the figures of a measurement with a mistake, `name` and `name_sigma`."""
     rng = np.random.default_rng([seed, 5])
     case = fault.case()
-    tracers = strewn_apart(rng)
+    tracers = small_rig.strewn_apart(rng)
     # they fill the depths but those near the focal plane
     x, y, z = tracers.position_mm.T
     off = np.copysign(OFF_FOCUS_MM + (1.0 - OFF_FOCUS_MM / HALF_DEPTH_MM) * np.abs(z), z)
     tracers = replace(tracers, position_mm=np.column_stack([x, y, off]))
-    moves = displacement(tracers.position_mm)
-    first, second = (photograph(case.true, tracers.moved(sign * moves), READOUT, rng) for sign in (-0.5, 0.5))
+    moves = small_rig.displacement(tracers.position_mm)
+    first, second = (small_rig.photograph(case.true, tracers.moved(sign * moves), READOUT, rng) for sign in (-0.5, 0.5))
     search, signs = replace(case, rounds=FEW_ROUNDS), np.array(fault.signs)
     found = [search.particles(image) * signs for image in fault.images((first, second))]
-    middle, moved = tracks_between(found[0], found[1], case.believed)
+    middle, moved = small_rig.tracks_between(found[0], found[1], case.believed)
     return place_and_velocity_figures(middle, moved, tracers.position_mm, moves)
 
 
@@ -208,7 +192,7 @@ def place_and_velocity_figures(middle: Points, moved: Points, true_places: Point
     """
     mirrorings = (1.0 - 2.0 * np.array(signs) for signs in np.ndindex(2, 2, 2))
     # many pairs, then near in depth
-    paired = (pairs_of(middle * signs, true_places, GATE_MM) for signs in mirrorings)
+    paired = (pairs_of(middle * signs, true_places, small_rig.GATE_MM) for signs in mirrorings)
     pairs = max(paired, key=lambda each: (len(each.found), -float(np.sum(np.abs(each.error_voxel)))))
     places, moves = middle[pairs.found], moved[pairs.found]
     true, expected = true_places[pairs.true], true_moves[pairs.true]

@@ -13,17 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lfpiv_cli.arrays import Floats, Integers, Singles
-from lfpiv_cli.flow.field import (
-    FLAG_NAMES,
-    MASKED,
-    MM_TO_M,
-    REJECTED,
-    REPLACED,
-    SECOND_PEAK,
-    VALID,
-    VectorField,
-    derived_fields,
-)
+from lfpiv_cli.flow import field as of_field
+from lfpiv_cli.flow.field import MM_TO_M, REJECTED, VALID, VectorField, derived_fields
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.pictures import style
 
@@ -121,10 +112,10 @@ def maps_figure(grid: Grid, rows: Sequence[MapRow]) -> style.Figure:
 
 FLAG_COLOURS = {
     VALID: style.BLUE,
-    SECOND_PEAK: style.SKY_BLUE,
-    REPLACED: style.ORANGE,
+    of_field.SECOND_PEAK: style.SKY_BLUE,
+    of_field.REPLACED: style.ORANGE,
     REJECTED: style.VERMILION,
-    MASKED: "0.85",
+    of_field.MASKED: "0.85",
 }
 # More arrows than this along an axis hide each other.
 MOST_ARROWS = 32
@@ -323,7 +314,7 @@ def flags_figure(field: VectorField) -> style.Figure:
     counts = field.flag_counts
     patches = [
         Patch(facecolor=FLAG_COLOURS[flag], edgecolor="0.3", label=f"{name}: {counts[name]}")
-        for flag, name in FLAG_NAMES.items()
+        for flag, name in of_field.FLAG_NAMES.items()
         if counts[name]
     ]
     figure.legend(handles=patches, loc="outside lower center", ncols=len(patches), title="vectors in the whole field")

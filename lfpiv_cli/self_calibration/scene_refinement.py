@@ -32,25 +32,10 @@ from lfpiv_cli.particles.rounds import find_particles
 from lfpiv_cli.particles.search import task_of
 from lfpiv_cli.particles.view import View, footprint_radius_mm, on_array_mm, raw_view, with_radius
 from lfpiv_cli.reconstruction.solvers import normalisers
-from lfpiv_cli.self_calibration.nuisances import (
-    ACROSS,
-    AWAY,
-    SCENE_STEPS,
-    TILT_ACROSS,
-    TILT_AWAY,
-    MovableScene,
-    Nuisances,
-    moved_places,
-    place_changes,
-)
-from lfpiv_cli.self_calibration.refinement import (
-    PLANES_APART,
-    REFINING_ROUNDS,
-    STEPS,
-    camera_figures,
-    first_image,
-    shift_px,
-)
+from lfpiv_cli.self_calibration import nuisances
+from lfpiv_cli.self_calibration import refinement as of_channel
+from lfpiv_cli.self_calibration.nuisances import MovableScene, Nuisances, moved_places
+from lfpiv_cli.self_calibration.refinement import PLANES_APART, REFINING_ROUNDS
 from lfpiv_cli.self_calibration.walls import RING_FROM, RoundWallFit, find_round_wall
 from lfpiv_cli.weights.columns import operator_of
 from lfpiv_cli.weights.model import Weights
@@ -59,7 +44,7 @@ from lfpiv_cli.weights.scene import curved_padding
 # Particles are looked for again where the wall has moved by more than this share of its radius, at most so often.
 SETTLED_SHARE, SEARCHES = 0.01, 3
 # Units of progress for the first image; the others take `refinement.STEPS`.
-STEPS_OF_FIRST = SEARCHES * (STEPS + 1)
+STEPS_OF_FIRST = SEARCHES * (of_channel.STEPS + 1)
 # The wall is the scene's own once it is found less than this share of the radius, or of a radian, beside it.
 FOUND_SHARE, MOST_STEPS = 1e-5, 8
 # Wall and images agree where the chi-squared of their four differences is below that which chance exceeds in 1e-4.
@@ -149,7 +134,7 @@ class SceneRefinement:
 
     def applied(self, calibration: Calibration, faces_sha256: str) -> Calibration:
         """Return the calibration with the scene and the lens images where the particles have them."""
-        fit = calibration.fit.shifted(shift_px(self.camera, self.nuisances))
+        fit = calibration.fit.shifted(of_channel.shift_px(self.camera, self.nuisances))
         return replace(
             calibration,
             rectification=replace(calibration.rectification, fit=fit),
@@ -174,7 +159,7 @@ class SceneRefinement:
             "disagreement_chi2": self.disagreement,
             "apparent_radius_mm": self.wall.radius_mm,
             "apparent_radius_mm_sigma": self.radius_sigma_mm,
-            **camera_figures(self.camera, self.particle_diameter_mm, self.nuisances, self.nuisances_sigma),
+            **of_channel.camera_figures(self.camera, self.particle_diameter_mm, self.nuisances, self.nuisances_sigma),
             "edge_blur_mm": self.wall.blur_mm,
             "stray_share": self.wall.stray_share,
         }
@@ -182,10 +167,12 @@ class SceneRefinement:
 
 def _told(name: str, axis: Floats, sigma: Floats) -> dict[str, Any]:
     """Return the corrections of an axis (4,) and their standard errors, tilts in degrees."""
-    tilt, tilt_sigma = (np.rad2deg(each[[TILT_ACROSS, TILT_AWAY]]).tolist() for each in (axis, sigma))
+    tilt, tilt_sigma = (
+        np.rad2deg(each[[nuisances.TILT_ACROSS, nuisances.TILT_AWAY]]).tolist() for each in (axis, sigma)
+    )
     return {
-        f"{name}_shift_mm": axis[[ACROSS, AWAY]].tolist(),
-        f"{name}_shift_mm_sigma": sigma[[ACROSS, AWAY]].tolist(),
+        f"{name}_shift_mm": axis[[nuisances.ACROSS, nuisances.AWAY]].tolist(),
+        f"{name}_shift_mm_sigma": sigma[[nuisances.ACROSS, nuisances.AWAY]].tolist(),
         f"{name}_tilt_deg": tilt,
         f"{name}_tilt_deg_sigma": tilt_sigma,
     }
@@ -235,7 +222,7 @@ def refine_scene(
             view = with_radius(view, 0.5 * lens_mm * measured.lenses)
             seen = start.applied(view, scene)
         work = task(images[0], seen)
-        fit, first = first_image(work, view, work.depths_mm, progress, scene, start)
+        fit, first = of_channel.first_image(work, view, work.depths_mm, progress, scene, start)
         moved = np.abs(fit.found.scene - start.scene)
         start = fit.found
         if np.all(moved[:2] < SETTLED_SHARE * scene.wall.radius_mm):
@@ -337,10 +324,10 @@ def _following(places_mm: Floats, own_mm: Floats, scene: MovableScene, axis: Flo
     outward = cosine[:, np.newaxis] * frame[1] + sine[:, np.newaxis] * frame[2]
     design = np.stack([cosine, sine, along * cosine, along * sine, np.ones(len(own))], axis=1)
     follows = np.empty((4, 4))
-    for unknown, step in enumerate(SCENE_STEPS):
+    for unknown, step in enumerate(nuisances.SCENE_STEPS):
         change = step * np.eye(4)[unknown]
         ahead, behind = scene.faces(axis + change), scene.faces(axis - change)
-        by = place_changes(places, ahead, behind, here, camera.aperture_radius_mm) / (2.0 * step)
+        by = nuisances.place_changes(places, ahead, behind, here, camera.aperture_radius_mm) / (2.0 * step)
         grown = np.sum(camera.to_image_axes(by) * outward, axis=1)
         follows[:, unknown] = np.linalg.lstsq(design, grown, rcond=None)[0][:4]
     return follows

@@ -24,19 +24,10 @@ from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.curved_space import CurvedSpace
 from lfpiv_cli.optics.tracing import ObjectSpace
 from lfpiv_cli.pictures.style import COLOURS, MARKERS, Figure, new_panels, styled
+from lfpiv_cli.weights import quadrature
 from lfpiv_cli.weights.build import factorise_through
 from lfpiv_cli.weights.columns import operator_of, seen_share
-from lfpiv_cli.weights.quadrature import (
-    DEPTH_NODES,
-    PAPERS_COUNT,
-    REFERENCE_DEPTH_NODES,
-    REFERENCE_TILES,
-    TILES,
-    RayCount,
-    count_rays,
-    integrate_columns,
-    sampling_error,
-)
+from lfpiv_cli.weights.quadrature import PAPERS_COUNT, integrate_columns
 from lfpiv_cli.weights.scene import lit_voxels
 from lfpiv_cli.weights.strip_blocks import sample_lit, voxel_centres
 from lfpiv_cli.weights.strips import StripOperator
@@ -170,10 +161,15 @@ def make_columns(
         exact direct tracing; 0: none
     progress : called with 1 after each voxel
     """
-    fine, coarse = (REFERENCE_TILES, REFERENCE_DEPTH_NODES), (REFERENCE_TILES // 2, REFERENCE_DEPTH_NODES)
+    fine, coarse = (
+        (quadrature.REFERENCE_TILES, quadrature.REFERENCE_DEPTH_NODES),
+        (quadrature.REFERENCE_TILES // 2, quadrature.REFERENCE_DEPTH_NODES),
+    )
     in_use: dict[str, ObjectSpace] = {}
     if isinstance(space, CurvedSpace):
-        ways: dict[str, tuple[Space, tuple[int, int]]] = {"on_demand": (space, (TILES, DEPTH_NODES))}
+        ways: dict[str, tuple[Space, tuple[int, int]]] = {
+            "on_demand": (space, (quadrature.TILES, quadrature.DEPTH_NODES))
+        }
         counted: dict[str, Space] = {"long_count": space}
         strips = operator_of(camera, space, grid)
     else:
@@ -206,11 +202,13 @@ def make_columns(
         for name, (rows, cells, weights) in columns_in_use.items():
             images[name] = np.zeros(shape)
             images[name][rows, cells] = weights
-        images["ray_count"] = count_rays(camera, counted["long_count"], point, sides, rng)
+        images["ray_count"] = quadrature.count_rays(camera, counted["long_count"], point, sides, rng)
         if rays:
             per_point = min(RAYS_PER_POINT_LONG, int(rays))
-            number = RayCount(int(rays) // per_point, per_point)
-            images |= {name: count_rays(camera, each, point, sides, rng, number) for name, each in counted.items()}
+            number = quadrature.RayCount(int(rays) // per_point, per_point)
+            images |= {
+                name: quadrature.count_rays(camera, each, point, sides, rng, number) for name, each in counted.items()
+            }
         # cut to the rectangle that any of them lights
         lit = np.any([image > 0.0 for image in images.values()], axis=0)
         if not lit.any():
@@ -233,7 +231,7 @@ def weights_figures(columns: list[Column], long_count: Integers) -> dict[str, An
                 entry[name] = compare_columns(column.images[reference], column.images[image])
         converged = column.images["ert"]
         entry["pixels"] = int(np.count_nonzero(converged))
-        entry["independent_rays_l1"] = sampling_error(converged, int(rays) or PAPERS_COUNT.rays)
+        entry["independent_rays_l1"] = quadrature.sampling_error(converged, int(rays) or PAPERS_COUNT.rays)
         voxels.append(entry)
     figures: dict[str, Any] = {}
     for name in COMPARISONS:
