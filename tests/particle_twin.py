@@ -18,21 +18,11 @@ from numba import njit
 from numpy.typing import NDArray
 
 from lfpiv_cli.arrays import Floats
+from lfpiv_cli.particles import response
 from lfpiv_cli.particles.cells import covered_share
 from lfpiv_cli.particles.micro_images import GAUSS_AT, GAUSS_WEIGHT, LONGEST, SMALLEST_SHARE
 from lfpiv_cli.particles.refraction import Bend, bend_of, displaced, is_seen
-from lfpiv_cli.particles.response import (
-    Along,
-    Bent,
-    Projection,
-    bent_at,
-    join_cell,
-    lenses_of,
-    lit_pixels,
-    mean_width,
-    project,
-    seen_moves,
-)
+from lfpiv_cli.particles.response import Along, Bent, Projection, bent_at, join_cell, lenses_of, lit_pixels, mean_width
 from lfpiv_cli.particles.view import View
 
 # Rows of a profile: mean and slope of P, their derivatives by x and by z, the patch's middle, and how far from the
@@ -95,7 +85,7 @@ def respond(view: View, x: float, y: float, z: float, pixels: NDArray[np.int32],
     bend = bend_of(view, x, y, z)
     if not is_seen(bend):
         return 0
-    projection = project(view, bend)
+    projection = response.project(view, bend)
     low_i, high_i, low_j, high_j = lenses_of(view, projection, bend)
     along_x = np.empty((PROFILE_ROWS, LONGEST))
     along_y = np.empty((PROFILE_ROWS, LONGEST))
@@ -215,7 +205,7 @@ def _join(view: View, projection: Projection, bend: Bend, lens: Lens, pixels: ND
             pixels[count] = (row + m) * camera.columns + column + n
             values[count, 0] = norm * light
             for j in range(3):
-                to_x, to_y, to_z_x, to_z_y = seen_moves(view, bend, j)
+                to_x, to_y, to_z_x, to_z_y = response.seen_moves(view, bend, j)
                 values[count, 1 + j] = norm * (to_x * by_x + to_y * by_y + to_z_x * by_z_x + to_z_y * by_z_y)
             count += 1
     return count

@@ -12,18 +12,10 @@ import numpy as np
 import pytest
 
 from lfpiv_cli.arrays import Floats
+from lfpiv_cli.calibration import model
 from lfpiv_cli.calibration.board_pose import BoardGeometry, BoardPose, pose_of_dots
 from lfpiv_cli.calibration.lattice import LatticeFit
-from lfpiv_cli.calibration.model import (
-    Calibration,
-    Channel,
-    DataSheet,
-    Photographs,
-    Rig,
-    advised_move_mm,
-    calibrate,
-    with_mid_plane,
-)
+from lfpiv_cli.calibration.model import Calibration, Channel, DataSheet, Photographs, Rig, calibrate, with_mid_plane
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.files.calibration_file import calibration_of, tree_of
 from lfpiv_cli.optics.camera import Camera, Lattice
@@ -71,7 +63,7 @@ def rig(table2: Camera, water: Media) -> Rig:
 
 def test_eq21_by_hand(water: Media) -> None:
     # t_b + t_w/n_ag + D/(2 n_w) = 1.5 + 5/1.49 + 10/2.66
-    advised = advised_move_mm(replace(BOARD, thickness_mm=1.5), CHANNEL, water)
+    advised = model.advised_move_mm(replace(BOARD, thickness_mm=1.5), CHANNEL, water)
     assert advised == pytest.approx(1.5 + 3.3557047 + 3.7593985)
 
 

@@ -28,15 +28,8 @@ from lfpiv_cli.optics.tracing import ObjectSpace
 from lfpiv_cli.paper.small_rig import Case, Rig
 from lfpiv_cli.particles.view import raw_view
 from lfpiv_cli.synthetic.render import Balls, Readout, render_points, render_white
-from lfpiv_cli.validation.planning import (
-    Tracer,
-    errors_alone_mm,
-    errors_by_depth_mm,
-    half_view_mm,
-    in_miniature,
-    part_in_front,
-    share_in_view,
-)
+from lfpiv_cli.validation import planning
+from lfpiv_cli.validation.planning import Tracer, errors_alone_mm, errors_by_depth_mm, half_view_mm, in_miniature
 from lfpiv_cli.validation.volume import pairs_of
 from lfpiv_cli.verbs.check import Pictures, image_lines, lattice_of
 from lfpiv_cli.verbs.checks import Line, worst
@@ -327,7 +320,7 @@ def test_the_part_in_front_of_a_box_is_where_its_tracers_are(take: Photographer)
     bounds = np.array([[0.3, 0.9], [-0.8, -0.5], [2.0, 2.2]])
     balls = Balls(np.array([[0.6, -0.65, 2.1]]), np.array([5e5]), 0.05)
     light = render_points(take.camera, ObjectSpace(WATER, None, "paraxial"), balls, take.rng, rays=4000)
-    rows, columns = part_in_front(take.camera, WATER, bounds)
+    rows, columns = planning.part_in_front(take.camera, WATER, bounds)
     row, column = (np.sum(light * each) / light.sum() for each in np.indices(light.shape))
     assert (rows.start + rows.stop) / 2 == pytest.approx(row, abs=3.0)
     assert (columns.start + columns.stop) / 2 == pytest.approx(column, abs=3.0)
@@ -337,7 +330,7 @@ def test_the_part_in_front_of_a_box_is_where_its_tracers_are(take: Photographer)
     points = take.rng.uniform(bounds[:, 0], bounds[:, 1], (20000, 3))
     inside = np.abs(points[:, 0]) <= half_view_mm(take.camera, WATER, points[:, 2])[:, 0]
     # Of so many points a share is known to a hundredth.
-    assert share_in_view(take.camera, WATER, bounds) == pytest.approx(np.mean(inside), abs=0.012)
+    assert planning.share_in_view(take.camera, WATER, bounds) == pytest.approx(np.mean(inside), abs=0.012)
 
 
 @pytest.mark.slow

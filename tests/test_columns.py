@@ -14,15 +14,9 @@ from lfpiv_cli.errors import ConfigError, InputError
 from lfpiv_cli.files.vtkhdf import open_volume
 from lfpiv_cli.files.weights_file import open_weights
 from lfpiv_cli.grid import Grid
+from lfpiv_cli.optics import tracing
 from lfpiv_cli.optics.camera import Lattice
-from lfpiv_cli.optics.tracing import (
-    ObjectSpace,
-    PolynomialRays,
-    complete_exponents,
-    disc_points,
-    polynomial_terms,
-    trace,
-)
+from lfpiv_cli.optics.tracing import ObjectSpace, PolynomialRays, complete_exponents, disc_points, polynomial_terms
 from lfpiv_cli.weights import columns as columns_module
 from lfpiv_cli.weights.build import factorise, factorise_bricks
 from lfpiv_cli.weights.columns import ColumnOperator, OnDemandOperator, operator_of
@@ -70,7 +64,7 @@ def fitted_to(space, camera, depths_mm=(-1.5, -0.5, 0.5, 1.5, 2.5), twist=0.0):
     rng = np.random.default_rng(3)
     points = np.column_stack([rng.uniform(-0.6, 0.6, (4000, 2)), rng.choice(depths_mm, 4000)])
     lens = disc_points(4000, camera.aperture_radius_mm, rng)
-    array = trace(camera, lens, slopes_equivalent(points, lens, camera, space.media)).array_mm
+    array = tracing.trace(camera, lens, slopes_equivalent(points, lens, camera, space.media)).array_mm
     array[:, 0] += twist * array[:, 1]
     scale, exponents = np.array([0.6, 0.6, 2.5, 12.5, 12.5]), complete_exponents(3)
     terms = polynomial_terms(np.column_stack([points, lens]) / scale, exponents)

@@ -11,18 +11,7 @@ from benchmarks.weights import against_sparse_matrix, share_of_matrix_product_ra
 from lfpiv_cli import simd
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.media import Media
-from lfpiv_cli.simd import (
-    COEFFICIENTS,
-    GROUP,
-    LANES,
-    TILE,
-    combine_reference,
-    combine_turned_reference,
-    combine_turned_varying_reference,
-    combine_varying_reference,
-    lanes_of,
-    turn_reference,
-)
+from lfpiv_cli.simd import COEFFICIENTS, GROUP, LANES, TILE, combine_reference, combine_turned_reference, lanes_of
 from lfpiv_cli.weights.build import factorise
 
 
@@ -78,10 +67,10 @@ def test_sums_with_varying_shares_equal_their_references(rng, count):
     expected = rng.standard_normal(step * LANES, np.float32)
     found = expected.copy()
     arguments = source, line, (1, step, 2, count), share, LANES, places, 3
-    combine_turned_varying_reference(expected, (2, step), *arguments)
+    simd.combine_turned_varying_reference(expected, (2, step), *arguments)
     compiled("combine_turned_varying", 9)(found, (2, step), *arguments)
     np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6)
-    combine_varying_reference(expected, 7, *arguments)
+    simd.combine_varying_reference(expected, 7, *arguments)
     compiled("combine_varying", 9)(found, 7, *arguments)
     np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6)
 
@@ -90,7 +79,7 @@ def test_turn_equals_its_reference_in_lanes_of_the_processor(rng):
     step = LANES + 3
     source, expected = rng.standard_normal((2, step * LANES), np.float32)
     found = expected.copy()
-    turn_reference(expected, (2, step), source, (1, step))
+    simd.turn_reference(expected, (2, step), source, (1, step))
     compiled("turn", 4)(found, (2, step), source, (1, step))
     np.testing.assert_array_equal(found, expected)
     assert lanes_of("+avx2,-avx512vl,+avx512f") == 16

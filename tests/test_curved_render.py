@@ -15,16 +15,8 @@ from lfpiv_cli.optics.curved_space import CurvedSpace, Face
 from lfpiv_cli.optics.media import Media, Window, fluid_path_to_focus
 from lfpiv_cli.optics.surfaces import Cylinder, Plane
 from lfpiv_cli.optics.tracing import ObjectSpace, disc_points, trace
-from lfpiv_cli.synthetic.rays import (
-    FITTED,
-    SEQUENCE,
-    TERMS,
-    TOLERANCE_MM,
-    fit_of_slopes,
-    fitted_slopes,
-    unseen,
-    write_terms,
-)
+from lfpiv_cli.synthetic import rays as of_rays
+from lfpiv_cli.synthetic.rays import FITTED, SEQUENCE, TERMS, TOLERANCE_MM, fit_of_slopes, fitted_slopes, unseen
 from lfpiv_cli.synthetic.render import Balls, render_points
 
 WATER = Media(1.0, 1.49, 1.33)
@@ -94,7 +86,7 @@ def test_fitted_slopes_are_right_where_they_say_so(camera: Camera, rng: np.rando
         lens, ball = disc_points(300, 1.0, rng), disc_points(300, 1.0, rng)
         terms = np.empty((300, TERMS))
         for k in range(300):
-            write_terms(*lens[k], *ball[k], terms[k])
+            of_rays.write_terms(*lens[k], *ball[k], terms[k])
         starts = point + radius * np.column_stack([ball, np.zeros(300)])
         slopes, leaves = tube().slopes(camera, starts, APERTURE_MM * lens)
         if is_right:

@@ -32,13 +32,7 @@ from lfpiv_cli.cli.main import cli
 from lfpiv_cli.errors import LimitMissedError
 from lfpiv_cli.files import calibration_file, particle_file, vtkhdf, weights_file
 from lfpiv_cli.files.export_vtk import PLAYBACK_FORMAT, PLAYBACK_VERSION, SERIES_FORMAT, SERIES_VERSION
-from lfpiv_cli.files.particle_file import (
-    PARTICLES_FORMAT,
-    TRACKS_FORMAT,
-    TRAJECTORIES_FORMAT,
-    read_points,
-    write_points,
-)
+from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, TRACKS_FORMAT, TRAJECTORIES_FORMAT, read_points
 from lfpiv_cli.files.vtkhdf import VECTORS_FORMAT, VOLUME_FORMAT
 from tests import camera_files
 from tests.commands import ROOT, SAMPLE
@@ -272,7 +266,9 @@ def write_third_frame(folder: Path) -> None:
     last = read_points(particles / "b.vtkhdf", PARTICLES_FORMAT)
     moved = last.position_mm.copy()
     moved[:, 0] += DT_S * (1e3 * 0.12 + 30.0 * moved[:, 2])
-    write_points(particles / "frame_2.vtkhdf", PARTICLES_FORMAT, replace(last, position_mm=moved), overwrite=False)
+    particle_file.write_points(
+        particles / "frame_2.vtkhdf", PARTICLES_FORMAT, replace(last, position_mm=moved), overwrite=False
+    )
 
 
 def chain_of(page: Path) -> list[str]:

@@ -13,16 +13,9 @@ from scipy.io import loadmat, netcdf_file
 
 from lfpiv_cli.errors import InputError, OutputError, UsageError
 from lfpiv_cli.files import export_formats as formats
+from lfpiv_cli.files import particle_file
 from lfpiv_cli.files.export_formats import FORMATS, Content, columns_of, read_content
-from lfpiv_cli.files.particle_file import (
-    OPTIONAL,
-    PARTICLES_FORMAT,
-    TRACKS_FORMAT,
-    TRAJECTORIES_FORMAT,
-    UNITS,
-    Points,
-    write_points,
-)
+from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, TRACKS_FORMAT, TRAJECTORIES_FORMAT, Points, write_points
 from lfpiv_cli.files.vtkhdf import write_vectors, write_volume
 from lfpiv_cli.flow.field import VectorField
 from lfpiv_cli.grid import Grid, Reference
@@ -53,7 +46,7 @@ def points_of(name: str, rng: np.random.Generator) -> Points:
     integers = {"particle", "particle_a", "particle_b"}
     arrays: dict[str, Any] = {
         each: rng.integers(0, 9, 5) if each in integers else rng.normal(size=shapes.get(each, (5,)))
-        for each in (*UNITS[name], *OPTIONAL.get(name, {}))
+        for each in (*particle_file.UNITS[name], *particle_file.OPTIONAL.get(name, {}))
     }
     if name == PARTICLES_FORMAT:
         arrays["flag"] = np.array([0, 1, 0, 0, 1], np.uint8)

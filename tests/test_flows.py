@@ -7,22 +7,8 @@ import pytest
 from scipy.integrate import quad, solve_ivp
 from scipy.spatial.transform import Rotation
 
-from lfpiv_cli.synthetic.flows import (
-    FLOWS,
-    STEADY,
-    Pulsation,
-    abc,
-    advect,
-    pipe,
-    random_modes,
-    rigid_rotation,
-    shear,
-    source,
-    square_duct,
-    taylor_green,
-    uniform,
-    vortex_ring,
-)
+from lfpiv_cli.synthetic import flows
+from lfpiv_cli.synthetic.flows import advect, pipe, random_modes, rigid_rotation, square_duct, taylor_green, vortex_ring
 
 WIDTH = 10.0
 MEAN = 0.1082
@@ -33,12 +19,12 @@ EXAMPLES = {
     "pipe": pipe(WIDTH / 2, MEAN, CENTRE, "y"),
     "rigid_rotation": rigid_rotation((1.0, -2.0, 3.0), CENTRE, (0.1, 0.0, 0.0)),
     "taylor_green": taylor_green(0.05, 8.0, CENTRE),
-    "shear": shear(4.0, "z", "x", CENTRE),
-    "uniform": uniform((0.1, -0.02, 0.03)),
+    "shear": flows.shear(4.0, "z", "x", CENTRE),
+    "uniform": flows.uniform((0.1, -0.02, 0.03)),
     "random_modes": random_modes(0.05, shortest_mm=8.0, centre_mm=CENTRE),
-    "abc": abc((0.05, 0.03, -0.02), 8.0, CENTRE),
+    "abc": flows.abc((0.05, 0.03, -0.02), 8.0, CENTRE),
     "vortex_ring": vortex_ring(0.05, 3.0, 2.0, "y", CENTRE),
-    "source": source(40.0, 2.0, CENTRE, (0.0, 0.01, 0.0)),
+    "source": flows.source(40.0, 2.0, CENTRE, (0.0, 0.01, 0.0)),
 }
 CELLULAR = taylor_green(0.05, 8.0, CENTRE, "yz", third_amplitude_m_s=0.03)
 SOLENOIDAL = {name: flow for name, flow in EXAMPLES.items() if name != "source"} | {"cellular": CELLULAR}
@@ -63,12 +49,12 @@ def gradient(flow, points, step):
 
 
 def test_registry_holds_every_flow_and_pressure_where_it_has_a_closed_form():
-    assert set(FLOWS) == set(EXAMPLES)
+    assert set(flows.FLOWS) == set(EXAMPLES)
     for name, flow in EXAMPLES.items():
         assert flow(np.zeros((4, 3))).shape == (4, 3), name
     moved = {"velocity_m_s": (0.0, 0.0, 0.1)}
     assert taylor_green(0.05, 8.0, **moved).pressure is None
-    assert abc((0.1, 0.1, 0.1), 8.0, **moved).pressure is None
+    assert flows.abc((0.1, 0.1, 0.1), 8.0, **moved).pressure is None
     assert CELLULAR.pressure is None
 
 
@@ -176,7 +162,9 @@ def test_rotation_shear_and_taylor_green_vortices_by_hand():
     points = np.array([(2.0, 5.0, 0.0), (1.0, 0.0, 1.0)]) + CENTRE
     assert flow(points) == pytest.approx(np.array([[0.05, 0.01, 0], [0.025, 0.01, -0.025]]), abs=1e-15)
     # 4 per second over 2 mm: 8 mm/s along z
-    assert shear(4.0, "z", "x", CENTRE)(np.array([(2.0, 1.0, 1.0)]) + CENTRE) == pytest.approx(np.array([[0, 0, 8e-3]]))
+    assert flows.shear(4.0, "z", "x", CENTRE)(np.array([(2.0, 1.0, 1.0)]) + CENTRE) == pytest.approx(
+        np.array([[0, 0, 8e-3]])
+    )
     # an eighth along all axes: each amplitude / 2^(3/2), that of z, the second axis, less the sum of the others
     expected = np.array([0.03, 0.05, -0.08]) / np.sqrt(8.0)
     assert CELLULAR(np.array([(1.0, 1.0, 1.0)]) + CENTRE)[0] == pytest.approx(expected, abs=1e-15)
@@ -231,7 +219,7 @@ def test_advection_follows_a_circle_and_returns(rng):
 
 
 def test_pulsation_carries_tracers_as_its_equation_of_motion_does():
-    flow, pulsation, start = EXAMPLES["taylor_green"], Pulsation(0.7, 40.0), np.array(CENTRE) + (1.0, 0.0, 1.5)
+    flow, pulsation, start = EXAMPLES["taylor_green"], flows.Pulsation(0.7, 40.0), np.array(CENTRE) + (1.0, 0.0, 1.5)
 
     def motion(time_s, place):
         return 1e3 * (1.0 + 0.7 * np.sin(2.0 * np.pi * 40.0 * time_s)) * flow(place[np.newaxis])[0]
@@ -240,9 +228,9 @@ def test_pulsation_carries_tracers_as_its_equation_of_motion_does():
         expected = solve_ivp(motion, (0.0, time_s), start, rtol=1e-10, atol=1e-10).y[:, -1]
         # four Runge-Kutta steps over 1 mm in vortices of 8 mm: 1e-5 mm
         assert advect(flow, [start], pulsation.carried_s(time_s))[0] == pytest.approx(expected, abs=2e-5)
-    assert STEADY.carried_s(-0.0123) == -0.0123
+    assert flows.STEADY.carried_s(-0.0123) == -0.0123
     # 50 % at 20 Hz: 2 pi 20 0.5 = 62.83 per second of the velocity; over 0.1 ms the cubic term is 1e-5 of it
-    pulsation, step = Pulsation(0.5, 20.0), 1e-4
+    pulsation, step = flows.Pulsation(0.5, 20.0), 1e-4
     change = (pulsation.carried_s(step) + pulsation.carried_s(-step) - 2.0 * pulsation.carried_s(0.0)) / step**2
     assert change == pytest.approx(62.832, rel=1e-4)
 

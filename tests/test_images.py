@@ -7,17 +7,8 @@ import pytest
 from scipy import ndimage
 
 from lfpiv_cli.errors import InputError
-from lfpiv_cli.reconstruction.images import (
-    as_if_lit,
-    defects,
-    filled,
-    light,
-    mean_background,
-    minimum_background,
-    noise_residual,
-    saturated,
-    touched,
-)
+from lfpiv_cli.reconstruction import images
+from lfpiv_cli.reconstruction.images import as_if_lit, defects, filled, light, noise_residual, saturated, touched
 
 
 def test_light_takes_off_dark_or_background_and_survives_broken_pixels():
@@ -29,7 +20,9 @@ def test_light_takes_off_dark_or_background_and_survives_broken_pixels():
         light(image, dark[:1])
 
 
-@pytest.mark.parametrize(("background", "expected"), [(minimum_background, [1.0, 3.0]), (mean_background, [2.0, 4.0])])
+@pytest.mark.parametrize(
+    ("background", "expected"), [(images.minimum_background, [1.0, 3.0]), (images.mean_background, [2.0, 4.0])]
+)
 def test_a_background_needs_two_images_of_one_shape(background, expected):
     a, b = np.array([[1.0, 5.0]]), np.array([[3.0, 3.0]])
     np.testing.assert_array_equal(background([a, b]), [expected])

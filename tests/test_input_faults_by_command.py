@@ -15,16 +15,10 @@ import numpy as np
 import pytest
 import yaml
 
+from lfpiv_cli.files import particle_file
 from lfpiv_cli.files.hdf5 import DIGEST, read_tree, write_tree
 from lfpiv_cli.files.images import count_pages
-from lfpiv_cli.files.particle_file import (
-    PARTICLES_FORMAT,
-    TRACKS_FORMAT,
-    TRAJECTORIES_FORMAT,
-    UNITS,
-    Points,
-    write_points,
-)
+from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, TRACKS_FORMAT, TRAJECTORIES_FORMAT, UNITS, Points
 from lfpiv_cli.files.vtkhdf import open_vectors, write_vectors, write_volume
 from lfpiv_cli.files.weights_file import FORMAT, VERSION
 from lfpiv_cli.files.weights_file import UNITS as WEIGHT_UNITS
@@ -198,7 +192,7 @@ def write_kind(path: Path, kind: str) -> None:
         assert ended("build-weights", rig, "-o", path) == (0, "")
     else:
         names = {"particles": PARTICLES_FORMAT, "tracks": TRACKS_FORMAT, "trajectories": TRAJECTORIES_FORMAT}
-        write_points(path, names[kind], points(names[kind]), overwrite=False)
+        particle_file.write_points(path, names[kind], points(names[kind]), overwrite=False)
 
 
 @pytest.fixture(scope="module")

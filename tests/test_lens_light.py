@@ -10,15 +10,10 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from lfpiv_cli.arrays import Floats
+from lfpiv_cli.calibration import light_checks
 from lfpiv_cli.calibration.lattice import lattice_through
 from lfpiv_cli.calibration.lens_light import PARTS, Cells, LensImages, folded
-from lfpiv_cli.calibration.light_checks import (
-    blur_notices,
-    dark_notices,
-    level_notices,
-    position_notices,
-    uniform_notices,
-)
+from lfpiv_cli.calibration.light_checks import blur_notices, dark_notices, level_notices, uniform_notices
 from lfpiv_cli.calibration.rectification import Rectification
 from lfpiv_cli.calibration.sheet import sheet_fit
 from lfpiv_cli.files.provenance import also_used_as
@@ -66,7 +61,7 @@ def places() -> Floats:
 
 
 def codes(images: LensImages, picture: Floats) -> list[str]:
-    return [notice.code for notice in position_notices(images, picture, "a", "b")]
+    return [notice.code for notice in light_checks.position_notices(images, picture, "a", "b")]
 
 
 @pytest.mark.thorough

@@ -13,6 +13,7 @@ from benchmarks.links import SCALE, Turbulence, shares
 from lfpiv_cli.arrays import Flags, Floats, Integers
 from lfpiv_cli.grid import Scale
 from lfpiv_cli.synthetic.flows import Flow, advect, random_modes, rigid_rotation
+from lfpiv_cli.tracks import tracking
 from lfpiv_cli.tracks.candidates import (
     NO_TRACK,
     Candidates,
@@ -24,18 +25,7 @@ from lfpiv_cli.tracks.candidates import (
 )
 from lfpiv_cli.tracks.gridding import Structure, kriged, on_grid, structure_of
 from lfpiv_cli.tracks.sequences import PAST_FRAMES, REACH_FRAMES, PartialTracks, begun, expected_in, extended, follow
-from lfpiv_cli.tracks.tracking import (
-    ALONE,
-    LEAST_LIGHT_RATIO,
-    NEIGHBOURS,
-    REACH,
-    WIDTHS_LENSES,
-    Forecast,
-    Tracks,
-    marginals,
-    track,
-    votes,
-)
+from lfpiv_cli.tracks.tracking import ALONE, LEAST_LIGHT_RATIO, NEIGHBOURS, WIDTHS_LENSES, Forecast, marginals, track
 
 # The paper's seeding in a corner of its volume: particles half a millimetre apart.
 SMALL = Turbulence(side_mm=5.0)
@@ -96,7 +86,7 @@ class Moved:
         covariance = np.tile([*sigma**2, 0.0, 0.0, 0.0], (count, 1))
         return cls(scale, Seen(frames[0], covariance), Seen(frames[1], covariance), both)
 
-    def right(self, links: Tracks) -> tuple[float, float]:
+    def right(self, links: tracking.Tracks) -> tuple[float, float]:
         """Return right links over the tracers in both frames, and wrong ones over all links."""
         right = np.count_nonzero((links.first == links.second) & (links.first < self.both))
         return right / self.both, 1.0 - right / max(len(links.first), 1)
@@ -185,7 +175,7 @@ def test_votes_are_the_sums_that_they_say(rng: np.random.Generator) -> None:
     first = np.sort(rng.integers(0, 30, 90))
     displacement, ratio = rng.normal(0.0, 0.1, (90, 3)), rng.uniform(0.0, 2.0, 90)
     ratio[::9] = 0.5 * LEAST_LIGHT_RATIO
-    found = votes(points, Candidates(first, first, displacement, ratio), 5.0, SCALE, equal)
+    found = tracking.votes(points, Candidates(first, first, displacement, ratio), 5.0, SCALE, equal)
     taken = ratio > LEAST_LIGHT_RATIO
     for c in range(90):
         order = np.argsort(np.linalg.norm(points - points[first[c]], axis=1))[1 : NEIGHBOURS + 1]
@@ -197,7 +187,7 @@ def test_votes_are_the_sums_that_they_say(rng: np.random.Generator) -> None:
                 for width in WIDTHS_LENSES:
                     sigma = width * SCALE.lens_mm
                     height = 1.0 / ((2.0 * np.pi) ** 1.5 * sigma**3 * 4.0 * len(WIDTHS_LENSES) * 5.0)
-                    near = off2 < (REACH * WIDTHS_LENSES[-1] * SCALE.lens_mm) ** 2
+                    near = off2 < (tracking.REACH * WIDTHS_LENSES[-1] * SCALE.lens_mm) ** 2
                     alike += near * ratio[other] * height * np.exp(-0.5 * off2 / sigma**2)
             support += np.log(ALONE + (1.0 - ALONE) * alike)
         assert found[c] == (pytest.approx(support + np.log(ratio[c]), rel=1e-12) if taken[c] else -np.inf)

@@ -13,28 +13,12 @@ import click
 import numpy as np
 import pytest
 
+from lfpiv_cli import names as of_names
 from lfpiv_cli.cli.main import cli
 from lfpiv_cli.console import readable
 from lfpiv_cli.files.sections import Section
 from lfpiv_cli.files.sections_work import CorrelationSection, FlowSection, Sections
-from lfpiv_cli.names import (
-    BoardMethod,
-    Divergence,
-    ExportFormat,
-    GridMethod,
-    Kept,
-    KnownCamera,
-    Method,
-    Moment,
-    Pairing,
-    PaperPart,
-    Refraction,
-    RunMethod,
-    Sampling,
-    Start,
-    Weighting,
-    names_in,
-)
+from lfpiv_cli.names import BoardMethod, Divergence, ExportFormat, GridMethod, Kept, Method, Pairing, names_in
 from lfpiv_cli.notice import written
 from lfpiv_cli.reconstruction.registry import PARTICLES, SOLVER_NAMES, SOLVERS
 from lfpiv_cli.synthetic.flows import FLOWS
@@ -45,24 +29,24 @@ TABLE2 = ROOT / "configs" / "table2.yaml"
 DOCUMENTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 # The options whose choices are names that others share, by command and option.
 OPTIONS = {
-    ("init", "camera"): names_in(KnownCamera),
-    ("run", "method"): names_in(RunMethod),
+    ("init", "camera"): names_in(of_names.KnownCamera),
+    ("run", "method"): names_in(of_names.RunMethod),
     ("run", "pairing"): names_in(Pairing),
     ("run", "keep"): names_in(Kept),
     ("build-weights", "method"): names_in(Method),
-    ("build-weights", "refraction"): names_in(Refraction),
-    ("build-weights", "sampling"): names_in(Sampling),
+    ("build-weights", "refraction"): names_in(of_names.Refraction),
+    ("build-weights", "sampling"): names_in(of_names.Sampling),
     ("reconstruct", "solver"): SOLVER_NAMES,
-    ("reconstruct", "start"): names_in(Start),
+    ("reconstruct", "start"): names_in(of_names.Start),
     ("reconstruct", "pairing"): names_in(Pairing),
     ("correlate", "pairing"): names_in(Pairing),
-    ("correlate", "weighting"): names_in(Weighting),
+    ("correlate", "weighting"): names_in(of_names.Weighting),
     ("field", "divergence"): names_in(Divergence),
     ("track", "by"): names_in(GridMethod),
     ("track", "pairing"): names_in(Pairing),
     ("export", "to"): names_in(ExportFormat),
-    ("validate", "frame"): names_in(Moment),
-    ("validate", "only"): names_in(PaperPart),
+    ("validate", "frame"): names_in(of_names.Moment),
+    ("validate", "only"): names_in(of_names.PaperPart),
 }
 # Names that are no words of plain English: where two of them stand side by side in a text, it lists names.
 LISTED = [SOLVER_NAMES, names_in(Method), names_in(BoardMethod), tuple(FLOWS)]

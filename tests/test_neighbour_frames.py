@@ -10,14 +10,8 @@ from lfpiv_cli.files.batch import Frame
 from lfpiv_cli.grid import Scale
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media
-from lfpiv_cli.particles.neighbour_frames import (
-    Predicted,
-    beyond_doubt,
-    find_predicted,
-    predicted_by,
-    second_frame,
-    second_pass,
-)
+from lfpiv_cli.particles import neighbour_frames
+from lfpiv_cli.particles.neighbour_frames import Predicted, find_predicted, predicted_by, second_frame, second_pass
 from lfpiv_cli.particles.rounds import first_pass
 from lfpiv_cli.particles.search import Task
 from lfpiv_cli.verbs import particles as particles_interface
@@ -112,7 +106,7 @@ def test_what_fits_and_finds_its_light_is_beyond_doubt(table2: Camera, water: Me
     true[1] = true[0] + (0.03, -0.02, 0.2, 0.0)
     task = task_with(table2, water, true, rng)
     as_one = [*(0.5 * (true[0] + true[1]))[:3], true[0, 3] + true[1, 3]]
-    sure = beyond_doubt(task, np.concatenate([true[2:], [as_one], strewn(rng, 3)]))
+    sure = neighbour_frames.beyond_doubt(task, np.concatenate([true[2:], [as_one], strewn(rng, 3)]))
     assert sure[:28].mean() > 0.8
     assert not sure[28:].any()
 

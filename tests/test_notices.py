@@ -13,15 +13,10 @@ import pytest
 from numpy.typing import NDArray
 
 import lfpiv_cli as lf
+from lfpiv_cli.calibration import sheet
 from lfpiv_cli.calibration.board_pose import BoardGeometry, BoardPose
 from lfpiv_cli.calibration.light_checks import check_residual, residual_share
-from lfpiv_cli.calibration.sheet import (
-    board_notices,
-    check_f_numbers,
-    f_number_notices,
-    image_distance_notices,
-    sheet_fit,
-)
+from lfpiv_cli.calibration.sheet import board_notices, check_f_numbers, image_distance_notices, sheet_fit
 from lfpiv_cli.calibration.white import lens_image_width
 from lfpiv_cli.console import Console
 from lfpiv_cli.errors import ConfigError, InputError
@@ -176,7 +171,7 @@ def test_residuals_and_f_numbers_that_are_refused(table2: Camera) -> None:
     for factor, count in ((0.85, 0), (1.2, 0), (1.67, 1), (0.6, 1)):
         camera = replace(table2, aperture_mm=factor * table2.aperture_mm)
         check_f_numbers(camera)
-        assert len(f_number_notices(camera)) == count
+        assert len(sheet.f_number_notices(camera)) == count
     for factor in (3.1, 0.3):
         with pytest.raises(ConfigError, match="aperture_mm: the main lens is f/"):
             check_f_numbers(replace(table2, aperture_mm=factor * table2.aperture_mm))

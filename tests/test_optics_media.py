@@ -6,16 +6,9 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
+from lfpiv_cli.optics import media as of_media
 from lfpiv_cli.optics.camera import Lattice
-from lfpiv_cli.optics.media import (
-    Media,
-    Window,
-    equivalent_object_distance,
-    exact_lateral_mm,
-    fluid_path_to_focus,
-    object_space_matrix,
-    snell_invariant,
-)
+from lfpiv_cli.optics.media import Media, Window, equivalent_object_distance, exact_lateral_mm, fluid_path_to_focus
 from lfpiv_cli.optics.tracing import disc_points, exact_slope, trace, trace_ray
 from tests.known_rays import slopes_equivalent, slopes_exact
 
@@ -32,14 +25,14 @@ def test_eq10_a_ray_keeps_its_lateral_position_and_eqs3_6_9_by_hand(water, windo
     assert water.in_air() == Media(1.0, 1.0, 1.0)
     assert water.depth_ratio == pytest.approx(1 / 1.33)
     # A ray parallel to the axis meets the lens at the point's own x: the equivalent point keeps it.
-    assert object_space_matrix(4.0, window, FOCUS, water)[:, 0] == pytest.approx([1.0, 0.0])
+    assert of_media.object_space_matrix(4.0, window, FOCUS, water)[:, 0] == pytest.approx([1.0, 0.0])
 
 
 @pytest.mark.parametrize("window", [Window(98.0, 2.0), Window(192.5, 5.0), Window(10.0, 0.0)])
 @pytest.mark.parametrize("z", [-5.0, -2.0, 0.0, 3.0, 8.0])
 def test_eqs14_15_direct_tracing_equals_equivalent_points_to_rounding(window, z, media):
     """The object-space matrix of the layers is that of the equivalent distance in air, its angle turned by n_w/n_a."""
-    matrix = object_space_matrix(z, window, FOCUS, media)
+    matrix = of_media.object_space_matrix(z, window, FOCUS, media)
     distance = equivalent_object_distance(z, FOCUS, media)
     ratio = media.fluid / media.air
     expected = np.array([[1.0, distance], [0.0, 1.0]]) @ np.diag([1.0, ratio])
@@ -67,7 +60,7 @@ def test_eq4_exact_snell_against_bisection(layers, share):
     distance = share * thicknesses.sum()
     top = np.nextafter(indices.min(), 0.0)
     found = brentq(lambda s: lateral(s, thicknesses, indices) - distance, 0.0, top * (1 - 1e-12), xtol=1e-15)
-    assert snell_invariant(distance, thicknesses, indices) == pytest.approx(found, rel=1e-11)
+    assert of_media.snell_invariant(distance, thicknesses, indices) == pytest.approx(found, rel=1e-11)
 
 
 def test_exact_snell_tends_to_the_paraxial_ray(water, window):
@@ -89,7 +82,7 @@ def test_aberration_at_the_edge_of_the_lens_through_the_paper_s_water_wherever_t
     path = fluid_path_to_focus(window, FOCUS, water)
     assert path == pytest.approx(134.0, abs=0.2)
     layers, indices = np.array([98.0, 2.0, path]), np.array([1.0, 1.49, 1.33])
-    invariant = snell_invariant(12.5, layers, indices)
+    invariant = of_media.snell_invariant(12.5, layers, indices)
     slope = invariant / np.sqrt(1.0 - invariant**2)
     # the outer ray, drawn on straight, crosses the axis this much nearer than the paraxial 200 mm
     assert FOCUS - 12.5 / slope == pytest.approx(0.085, abs=0.002)
@@ -227,7 +220,9 @@ def test_exact_slopes_tend_to_the_paraxial_ones_near_the_axis_and_invert(table2,
     for thicknesses, indices in LAYERS[:3]:
         slope = rng.uniform(0.0, 0.3)
         sideways = float(exact_lateral_mm(slope, thicknesses, indices, 1.0))
-        assert snell_invariant(sideways, thicknesses, indices) == pytest.approx(slope / np.hypot(1, slope), rel=1e-12)
+        assert of_media.snell_invariant(sideways, thicknesses, indices) == pytest.approx(
+            slope / np.hypot(1, slope), rel=1e-12
+        )
 
 
 def test_kernel_traces_as_its_twin(camera, water, rng):

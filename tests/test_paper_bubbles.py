@@ -19,14 +19,9 @@ from lfpiv_cli.optics.camera import Camera, Lattice
 from lfpiv_cli.optics.media import Media, equivalent_object_distance
 from lfpiv_cli.optics.surfaces import Surface
 from lfpiv_cli.optics.tracing import ObjectSpace
+from lfpiv_cli.paper import camera as of_camera
 from lfpiv_cli.paper.bubbles import _rows, bubbles
-from lfpiv_cli.paper.camera import (
-    discussion,
-    elongations_mm,
-    geometric_depth_mm,
-    smallest_errors_crowded_mm,
-    smallest_errors_mm,
-)
+from lfpiv_cli.paper.camera import discussion, elongations_mm, geometric_depth_mm, smallest_errors_mm
 from lfpiv_cli.paper.parts import Work, read_json
 from lfpiv_cli.paper.table4 import TINY, channel_sections
 from lfpiv_cli.reconstruction.images import LARGEST_STILL, still_light
@@ -208,7 +203,8 @@ def test_depth_is_known_least_at_the_focal_plane_and_less_beside_neighbours(smal
     # Neighbours cost accuracy.
     crowd = replace(small_camera, columns=160, rows=160)
     few, many = (
-        smallest_errors_crowded_mm(crowd, WATER, each, 4.0, Readout(), np.random.default_rng(3)) for each in (0.05, 1.0)
+        of_camera.smallest_errors_crowded_mm(crowd, WATER, each, 4.0, Readout(), np.random.default_rng(3))
+        for each in (0.05, 1.0)
     )
     assert many[2] > 1.2 * few[2]
 

@@ -17,34 +17,9 @@ from lfpiv_cli.files.vtkhdf import write_vectors
 from lfpiv_cli.flow.field import VALID, VectorField
 from lfpiv_cli.grid import FOCAL_POINT, Grid
 from lfpiv_cli.optics.media import equivalent_object_distance
-from lfpiv_cli.paper import small_rig
-from lfpiv_cli.paper.faults import (
-    FAULTS,
-    LIMIT_SIGMAS,
-    NONE,
-    WORDS,
-    Limit,
-    allowed,
-    fault_rows,
-    fault_table,
-    limits_of,
-    missed_limits,
-    place_and_velocity_figures,
-    said_to,
-)
-from lfpiv_cli.paper.influences import (
-    DISTANCE,
-    F_NUMBERS,
-    FOCUS,
-    INDEX,
-    LEVER,
-    NOISE,
-    PAPER_PER_LENS,
-    SEEDING,
-    SHIFT,
-    WALL,
-    Influence,
-)
+from lfpiv_cli.paper import faults, influences, small_rig
+from lfpiv_cli.paper.faults import FAULTS, LIMIT_SIGMAS, NONE, WORDS, Limit, allowed, fault_rows, missed_limits, said_to
+from lfpiv_cli.paper.influences import DISTANCE, F_NUMBERS, FOCUS, INDEX, LEVER, NOISE, SHIFT, WALL, Influence
 from lfpiv_cli.paper.parts import sections
 from lfpiv_cli.paper.sensitivities import INFLUENCES, Measured, care, crowding, drawing_of, rows_of, table_of
 from lfpiv_cli.paper.small_rig import CHANNEL, WATER, Case, Rig, displacement
@@ -61,10 +36,10 @@ def tracks(seed: int, change: Any = lambda middle, moved: (middle, moved)) -> di
     true = small_rig.strewn_apart(rng).position_mm
     moves = displacement(true)
     middle, moved = (values + rng.normal(0.0, SIGMA_MM, true.shape) for values in (true, moves))
-    return place_and_velocity_figures(*change(middle, moved), true, moves)
+    return faults.place_and_velocity_figures(*change(middle, moved), true, moves)
 
 
-LIMITS = limits_of(tracks(100))
+LIMITS = faults.limits_of(tracks(100))
 SIGNS = np.array([1.0, 1.0, -1.0])
 
 
@@ -118,7 +93,7 @@ def test_rows_tell_which_figure_gave_a_mistake_away_and_false_alarms():
     missed, wrong = fault_rows({"pair swapped": good}, swapped, LIMITS)
     assert (missed.best, missed.verdict, wrong.verdict) == (0.0, "missed", "missed")
     assert "slope of u is -200 %" in wrong.reason
-    table = fault_table({"pair swapped": swapped}, good, LIMITS)
+    table = faults.fault_table({"pair swapped": swapped}, good, LIMITS)
     assert [row[0] for row in table.rows] == ["no mistake", *["pair swapped"] * 3]
     assert [row[-1] for row in table.rows] == ["met", *["missed"] * 3]
     assert said_to(good, LIMITS) == ""
@@ -245,7 +220,7 @@ def test_influences_are_fitted_pictured_and_strewn_as_they_are_named():
     tracers = small_rig.strewn(0.5, np.random.default_rng(4))
     width = np.ptp(tracers.position_mm[:, 0])
     assert len(tracers.position_mm) / (width / 0.1) ** 2 == pytest.approx(0.5, rel=0.05)
-    assert pytest.approx(0.67, abs=0.005) == PAPER_PER_LENS
+    assert pytest.approx(0.67, abs=0.005) == influences.PAPER_PER_LENS
     true = small_rig.strewn_apart(np.random.default_rng(2)).position_mm
     shuffled = np.random.default_rng(3).permutation(len(true))
     pairs = pairs_of(true[shuffled] + [0.02, -0.03, -2.7], true, small_rig.GATE_MM)
@@ -322,7 +297,7 @@ def test_what_harms_most_comes_first():
 
 @pytest.mark.parametrize(("recall", "told"), [((0.97, 0.95, 0.6), "from 1.2 on"), ((1.0, 1.0, 1.0), "at none")])
 def test_from_where_tracers_crowd(recall: tuple[float, ...], told: str):
-    found = lines_of(SEEDING, {})
+    found = lines_of(influences.SEEDING, {})
     found.figures["recall"][:] = np.array(recall)[:, np.newaxis]  # type: ignore[index]
     assert told in crowding(found)
 

@@ -9,17 +9,7 @@ import pytest
 from lfpiv_cli.errors import InputError, OutputError, OutputExistsError
 from lfpiv_cli.files import hdf5, particle_file
 from lfpiv_cli.files.export_vtk import write_playback
-from lfpiv_cli.files.particle_file import (
-    PARTICLES_FORMAT,
-    POSITION,
-    TRACKS_FORMAT,
-    TRAJECTORIES_FORMAT,
-    Points,
-    StoredTracks,
-    read_points,
-    symmetric,
-    write_points,
-)
+from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, POSITION, Points, StoredTracks, read_points, write_points
 from lfpiv_cli.grid import Reference
 from lfpiv_cli.verbs.track import KEPT_FRAMES, SeenFrames
 
@@ -48,7 +38,7 @@ def test_what_is_written_is_read_and_vtk_opens_the_very_file(path: Path) -> None
     assert points.reference == REFERENCE
     assert points.provenance == {"a": 1}
     matrix = np.array([[[1.0, 4.0, 6.0], [4.0, 2.0, 5.0], [6.0, 5.0, 3.0]]])
-    assert symmetric(matrix).tolist() == [[1.0, 2.0, 3.0, 4.0, 5.0, 6.0]]
+    assert particle_file.symmetric(matrix).tolist() == [[1.0, 2.0, 3.0, 4.0, 5.0, 6.0]]
     vtk = pytest.importorskip("vtkmodules.vtkIOHDF")
     from vtkmodules.util.numpy_support import vtk_to_numpy
 
@@ -66,7 +56,7 @@ def test_what_is_written_is_read_and_vtk_opens_the_very_file(path: Path) -> None
 
 def test_another_format_and_values_that_are_no_numbers_are_refused(path: Path) -> None:
     with pytest.raises(InputError, match="lfpiv-tracks"):
-        read_points(path, TRACKS_FORMAT)
+        read_points(path, particle_file.TRACKS_FORMAT)
     with h5py.File(path, "a") as file:
         file["chi2"][2] = np.nan
     with pytest.raises(InputError, match="chi2"):
@@ -145,7 +135,7 @@ def test_files_are_those_of_tracks_in_memory(
     monkeypatch.setattr(particle_file, "CHECKED_ROWS", 30)
     with put(tmp_path, many_tracks) as stored:
         for name, each in (("memory", many_tracks), ("disk", stored)):
-            write_points(tmp_path / f"{name}.vtkhdf", TRAJECTORIES_FORMAT, each, overwrite=False)
+            write_points(tmp_path / f"{name}.vtkhdf", particle_file.TRAJECTORIES_FORMAT, each, overwrite=False)
             write_playback(tmp_path / f"{name}_played.vtkhdf", each, FRAMES, 0.1, overwrite=False)
     for name in ("{}.vtkhdf", "{}_played.vtkhdf"):
         memory, disk = ((tmp_path / name.format(each)).read_bytes() for each in ("memory", "disk"))
@@ -174,16 +164,19 @@ def test_no_tracks_are_written_too(tmp_path: Path) -> None:
     with StoredTracks(tmp_path, REFERENCE, {}, {}) as store:
         store.put(nothing)
         store.put(nothing)
-        write_points(tmp_path / "none.vtkhdf", TRAJECTORIES_FORMAT, store, overwrite=False)
+        write_points(tmp_path / "none.vtkhdf", particle_file.TRAJECTORIES_FORMAT, store, overwrite=False)
         write_playback(tmp_path / "played.vtkhdf", store, 2, 0.1, overwrite=False)
     with h5py.File(tmp_path / "none.vtkhdf") as file:
         assert file[POSITION].shape == (0, 3)
     pair = {name: np.zeros((0, 3)) for name in ("velocity", "velocity_sigma", "displacement_mm")}
     pair |= {name: np.zeros(0, np.int64) for name in ("particle_a", "particle_b")} | {"link_probability": np.zeros(0)}
     write_points(
-        tmp_path / "t.vtkhdf", TRACKS_FORMAT, Points(np.zeros((0, 3)), pair, REFERENCE, {}, {}), overwrite=False
+        tmp_path / "t.vtkhdf",
+        particle_file.TRACKS_FORMAT,
+        Points(np.zeros((0, 3)), pair, REFERENCE, {}, {}),
+        overwrite=False,
     )
-    assert read_points(tmp_path / "t.vtkhdf", TRACKS_FORMAT).position_mm.shape == (0, 3)
+    assert read_points(tmp_path / "t.vtkhdf", particle_file.TRACKS_FORMAT).position_mm.shape == (0, 3)
 
 
 def test_a_full_disk_and_a_folder_that_takes_nothing_are_told(

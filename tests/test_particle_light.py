@@ -18,20 +18,7 @@ from lfpiv_cli.particles import search
 from lfpiv_cli.particles.fitting import add_all
 from lfpiv_cli.particles.least_squares import observation_of
 from lfpiv_cli.particles.microlens_focus import FEWEST_PARTICLES, FocalLength, focal_length_of
-from lfpiv_cli.particles.search import (
-    DOUBTFUL_EXCESS,
-    MUCH_LEFT,
-    TAKEN_UP,
-    blank,
-    changes_of_light,
-    grown,
-    light_left,
-    missing_light,
-    noise_with,
-    rebuilt,
-    result,
-    with_other_places,
-)
+from lfpiv_cli.particles.search import DOUBTFUL_EXCESS, MUCH_LEFT, TAKEN_UP, blank, grown, light_left, missing_light
 from lfpiv_cli.particles.view import View, raw_view
 from lfpiv_cli.verbs.frames import Bench, bench_of, frame_notices
 from lfpiv_cli.verbs.particles import find, frame_of, points_of, task_for, tracers_per_lens
@@ -110,7 +97,7 @@ def with_others(view: View, place: tuple[float, ...], light: float, noise: Float
     residual = noise * np.sqrt(variance)
     observation = observation_of(view, residual.copy(), 1.0 / variance, DEPTHS)
     covariance = np.diag(np.square([*SURE_MM, 0.01 * light]))[np.newaxis]
-    found, other = with_other_places(observation, particle, covariance, np.ones(1), 0.0)
+    found, other = search.with_other_places(observation, particle, covariance, np.ones(1), 0.0)
     np.testing.assert_allclose(observation.residual, residual, atol=1e-6)
     return np.sqrt(np.diagonal(found[0])), bool(other[0])
 
@@ -140,7 +127,9 @@ def test_errors_do_not_grow_for_tracers_lost_elsewhere(table2: Camera, water: Me
     true = np.array([[-0.6, 0.0, 1.5, 5e5], [0.6, 0.0, 1.5, 5e5]])
     task = task_with(table2, water, true, rng)
     covariance = [
-        result(task, replace(rebuilt(task, blank(task), found), noise=noise_with(task, 5e5))).covariance_mm2[0]
+        search.result(
+            task, replace(search.rebuilt(task, blank(task), found), noise=search.noise_with(task, 5e5))
+        ).covariance_mm2[0]
         for found in (true, true[:1])
     ]
     # Left alone 0.7 of the light is.
@@ -162,7 +151,7 @@ def test_changes_are_those_of_independent_errors(view: View, monkeypatch: pytest
     covariance = np.array([[4e-4, -1e-4], [-1e-4, 2e-4]])
     for diameter in (0.5, 0.01):
         sized = view._replace(particle_radius_mm=0.5 * diameter * scene, diffusion_px=0.3)
-        changes = changes_of_light(sized, np.zeros((0, 4)), covariance, (0.0, 1.0))[:, 0]
+        changes = search.changes_of_light(sized, np.zeros((0, 4)), covariance, (0.0, 1.0))[:, 0]
         slopes = np.array([3.0, 5.0])
         assert changes @ changes == pytest.approx(slopes @ covariance @ slopes)
 

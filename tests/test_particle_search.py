@@ -14,18 +14,7 @@ from lfpiv_cli.particles import search
 from lfpiv_cli.particles.fitting import add_all, refine
 from lfpiv_cli.particles.joining import with_twins_joined
 from lfpiv_cli.particles.least_squares import SMALLEST_GAIN, Observation
-from lfpiv_cli.particles.search import (
-    State,
-    Task,
-    blank,
-    disturbance,
-    merge,
-    noise_with,
-    observed,
-    overlaps_of,
-    rebuilt,
-    sweep,
-)
+from lfpiv_cli.particles.search import State, Task, blank, disturbance, merge, noise_with, observed, rebuilt
 from tests.particle_images import found, task_with
 
 SWEEPS = 6
@@ -59,7 +48,7 @@ def test_sweeps_end_where_those_over_all_end(task: Task, true: Floats, monkeypat
     for _ in range(SWEEPS):
         refine(observed(task, every, 0.05), every.particles, SMALLEST_GAIN)
     monkeypatch.setattr(search, "refine", counted)
-    sweep(task, some, 0.05, SWEEPS, SMALLEST_GAIN)
+    search.sweep(task, some, 0.05, SWEEPS, SMALLEST_GAIN)
     assert fitted[0] == len(true)
     assert fitted[-1] < 0.6 * len(true)
     # What ends a fit is a tenth of a standard error, and here one is 1e-4 mm laterally, 1e-3 mm in depth, 500 counts.
@@ -90,7 +79,7 @@ def test_particles_disturb_those_whose_light_they_share(task: Task) -> None:
     particles = np.array(
         [[0.0, 0.0, 2.0, 1.0], [0.0, 0.0, 2.0, 1.0], [0.1, 0.0, 2.0, 1.0], [0.0, 0.05, 1.0, 1.0], [0.9, 0.7, 1.0, 1.0]]
     )
-    overlaps = overlaps_of(task.view, particles)
+    overlaps = search.overlaps_of(task.view, particles)
     seen = np.array([disturbance(overlaps, 10.0 * one) for one in np.eye(5)])
     assert seen[0, 1] == seen[1, 0] == 10.0
     assert not seen.diagonal().any()

@@ -11,17 +11,10 @@ from threadpoolctl import threadpool_limits
 
 from lfpiv_cli.arrays import root_of_squares
 from lfpiv_cli.errors import InputError, OutputExistsError, PartialError, UsageError
-from lfpiv_cli.files import vtkhdf
+from lfpiv_cli.files import particle_file, vtkhdf
 from lfpiv_cli.files.config import carried_config, load_rig
 from lfpiv_cli.files.images import read_image
-from lfpiv_cli.files.particle_file import (
-    PARTICLES_FORMAT,
-    TRACKS_FORMAT,
-    TRAJECTORIES_FORMAT,
-    Points,
-    read_points,
-    write_points,
-)
+from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, TRACKS_FORMAT, TRAJECTORIES_FORMAT, Points, read_points
 from lfpiv_cli.files.particles import read_particles
 from lfpiv_cli.files.vtkhdf import open_vectors
 from lfpiv_cli.grid import Reference
@@ -49,7 +42,7 @@ def write_frame(path: Path, position_mm: np.ndarray, **changes: object) -> None:
     resolved = load_rig(CONFIG).resolved() | changes
     arrays["flag"] = np.zeros(n, np.uint8)
     points = Points(position_mm, arrays, Reference("mid_plane", 0.5), {}, {"config": resolved})
-    write_points(path, PARTICLES_FORMAT, points, overwrite=True)
+    particle_file.write_points(path, PARTICLES_FORMAT, points, overwrite=True)
 
 
 @pytest.fixture

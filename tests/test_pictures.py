@@ -17,22 +17,11 @@ from lfpiv_cli.optics.curved_space import CurvedSpace, Face
 from lfpiv_cli.optics.media import Media
 from lfpiv_cli.optics.surfaces import Cylinder
 from lfpiv_cli.pictures import points as of_points
+from lfpiv_cli.pictures import style
 from lfpiv_cli.pictures import vectors as of_volume
 from lfpiv_cli.pictures import vectors as pictures
 from lfpiv_cli.pictures.statistics import convergence_figure
-from lfpiv_cli.pictures.style import (
-    COLOURS,
-    DIVERGING,
-    MARKERS,
-    SEQUENTIAL,
-    SETTINGS,
-    SLABS,
-    new_figure,
-    percentiles_by_depth,
-    scale_of,
-    styled,
-    symmetric_limit,
-)
+from lfpiv_cli.pictures.style import COLOURS, MARKERS, SETTINGS, SLABS, percentiles_by_depth, scale_of, symmetric_limit
 from lfpiv_cli.verbs.plot import figures_of
 
 matplotlib = pytest.importorskip("matplotlib")
@@ -177,9 +166,9 @@ def test_projections_are_the_largest_along_each_axis_and_columns_have_pixels_and
 
 
 def test_the_style_holds_within_and_leaves_the_callers_settings() -> None:
-    @styled
+    @style.styled
     def draw():
-        figure = new_figure(3.0, 2.0)
+        figure = style.new_figure(3.0, 2.0)
         axis = figure.subplots()
         lines = [axis.plot([0, 1], [k, k])[0] for k in range(2)]
         return figure, axis, lines
@@ -346,9 +335,9 @@ def test_figures_of_a_file_follow_what_it_knows(field: NDArray[np.float64], tmp_
 
 def test_colours_are_about_zero_where_there_are_both_signs_and_begin_at_the_least_elsewhere() -> None:
     two = scale_of(np.array([-1.0, np.nan]), np.array([3.0]))
-    assert (two["vmin"], two["vmax"], two["cmap"]) == (-3.0, 3.0, DIVERGING)
+    assert (two["vmin"], two["vmax"], two["cmap"]) == (-3.0, 3.0, style.DIVERGING)
     one = scale_of(np.array([0.07, 0.16]))
-    assert (one["vmin"], one["vmax"], one["cmap"]) == (0.07, 0.16, SEQUENTIAL)
+    assert (one["vmin"], one["vmax"], one["cmap"]) == (0.07, 0.16, style.SEQUENTIAL)
     for flat in (np.zeros(3), np.full(3, np.nan)):
         assert scale_of(flat)["vmax"] > scale_of(flat)["vmin"]
 

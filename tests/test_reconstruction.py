@@ -15,19 +15,7 @@ from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.camera import Lattice
 from lfpiv_cli.reconstruction import solvers
 from lfpiv_cli.reconstruction.registry import SOLVERS
-from lfpiv_cli.reconstruction.solvers import (
-    Momentum,
-    Problem,
-    SolverSettings,
-    Stopping,
-    line_of_sight_start,
-    lit_support,
-    mart_step,
-    normalisers,
-    reconstruct,
-    sart_step,
-    smart_step,
-)
+from lfpiv_cli.reconstruction.solvers import Momentum, Problem, SolverSettings, Stopping, normalisers, reconstruct
 from lfpiv_cli.verbs.checks import word_of
 from lfpiv_cli.verbs.frames import Background
 from lfpiv_cli.weights.build import factorise
@@ -75,7 +63,7 @@ def test_sart_step_is_eq_12_written_as_loops(dense, rng):
         expected[j] += 0.7 * numerator / denominator
     problem = Problem(dense, image[np.newaxis].astype(np.float32), normalisers(dense))
     start = volume.reshape(dense.shape).astype(np.float32)
-    stepped = sart_step(problem, start, dense.forward(start), relaxation=0.7)
+    stepped = solvers.sart_step(problem, start, dense.forward(start), relaxation=0.7)
     np.testing.assert_allclose(stepped.ravel(), np.maximum(expected, 0.0), rtol=1e-5)
 
 
@@ -121,13 +109,17 @@ def test_mart_takes_its_pixels_in_turn_and_smart_all_at_once(dense, rng):
             expected[j] *= np.exp(0.8 * exponent / largest)
     problem = Problem(dense, image[np.newaxis].astype(np.float32), normalisers(dense))
     start = volume.reshape(dense.shape).astype(np.float32)
-    np.testing.assert_allclose(mart_step(problem, start, dense.forward(start), 0.8).ravel(), expected, rtol=1e-4)
+    np.testing.assert_allclose(
+        solvers.mart_step(problem, start, dense.forward(start), 0.8).ravel(), expected, rtol=1e-4
+    )
     w, image, volume = dense.matrix, rng.random(9) + 0.5, rng.random(5) + 0.5
     ratio = np.divide(image, w @ volume, out=np.ones(9), where=w.sum(axis=1) > 0)
     expected = volume * np.prod(ratio[:, np.newaxis] ** w, axis=0) ** (0.8 / w.sum(axis=0))
     problem = Problem(dense, image[np.newaxis].astype(np.float32), normalisers(dense))
     start = volume.reshape(dense.shape).astype(np.float32)
-    np.testing.assert_allclose(smart_step(problem, start, dense.forward(start), 0.8).ravel(), expected, rtol=1e-4)
+    np.testing.assert_allclose(
+        solvers.smart_step(problem, start, dense.forward(start), 0.8).ravel(), expected, rtol=1e-4
+    )
 
 
 @pytest.mark.parametrize("accelerate", [False, True])
@@ -162,7 +154,9 @@ def test_line_of_sight_start_is_the_geometric_mean_of_what_pixels_allow(dense, r
     seen = w.sum(axis=1) > 0
     level = image[seen] / w[seen].sum(axis=1)
     expected = np.prod(level[:, np.newaxis] ** w[seen], axis=0) ** (1.0 / w.sum(axis=0))
-    start = line_of_sight_start(Problem.of(dense, image[np.newaxis].astype(np.float32), normalisers(dense))).ravel()
+    start = solvers.line_of_sight_start(
+        Problem.of(dense, image[np.newaxis].astype(np.float32), normalisers(dense))
+    ).ravel()
     np.testing.assert_allclose(start / start[0], expected / expected[0], rtol=1e-4)
     assert (w @ start)[seen].sum() == pytest.approx(image[seen].sum(), rel=1e-4)
 
@@ -172,10 +166,10 @@ def test_line_of_sight_leaves_dark_voxels_out_for_good(optical):
     truth[2, 3, 4] = 100.0
     image = optical.forward(truth)
     sums = normalisers(optical)
-    support = lit_support(optical, image, sums)
+    support = solvers.lit_support(optical, image, sums)
     assert support[2, 3, 4]
     assert support.sum() < 0.5 * support.size
-    start = line_of_sight_start(Problem(optical, image, sums))
+    start = solvers.line_of_sight_start(Problem(optical, image, sums))
     assert np.unravel_index(start.argmax(), start.shape) == (2, 3, 4)
     assert start.sum() == pytest.approx(100.0, rel=0.05)
     # voxels of the support do not light the whole sensor: the pixels they miss are left out with the others

@@ -13,18 +13,12 @@ from click.testing import CliRunner
 from lfpiv_cli.cli.main import cli
 from lfpiv_cli.console import Console
 from lfpiv_cli.errors import InputError, OutputExistsError, UsageError
+from lfpiv_cli.files import particle_file
 from lfpiv_cli.files.config import load_rig
 from lfpiv_cli.files.hdf5 import write_tree
 from lfpiv_cli.files.images import write_tiff
 from lfpiv_cli.files.pages import Page, Picture
-from lfpiv_cli.files.particle_file import (
-    PARTICLES_FORMAT,
-    TRACKS_FORMAT,
-    TRAJECTORIES_FORMAT,
-    UNITS,
-    Points,
-    write_points,
-)
+from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, TRACKS_FORMAT, TRAJECTORIES_FORMAT, Points, write_points
 from lfpiv_cli.files.provenance import sha256
 from lfpiv_cli.files.vtkhdf import open_vectors, write_vectors, write_volume
 from lfpiv_cli.flow.windows import ParallelWalls
@@ -346,7 +340,8 @@ def points(rng: np.random.Generator, of_format: str, provenance: dict) -> Points
     """Return points with every array that their format has."""
     tensors, vectors = ("covariance_mm2",), ("velocity", "velocity_sigma", "displacement_mm")
     arrays = {
-        name: rng.random((N, 6) if name in tensors else (N, 3) if name in vectors else N) for name in UNITS[of_format]
+        name: rng.random((N, 6) if name in tensors else (N, 3) if name in vectors else N)
+        for name in particle_file.UNITS[of_format]
     }
     for name in ("track", "frame", "particle", "particle_a", "particle_b", "flag"):
         if name in arrays:

@@ -12,21 +12,11 @@ from lfpiv_cli.flow.windows import RoundWall
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.media import Media, channel_window, fluid_path_to_focus
 from lfpiv_cli.optics.tracing import ObjectSpace
+from lfpiv_cli.synthetic import scenes
 from lfpiv_cli.synthetic.board import BoardPlacement
 from lfpiv_cli.synthetic.flows import Pulsation, advect, random_modes, rigid_rotation, uniform
 from lfpiv_cli.synthetic.render import Balls, Readout, render_points
-from lfpiv_cli.synthetic.scenes import (
-    Box,
-    Misalignment,
-    Motion,
-    RecordingCamera,
-    Tracers,
-    channel_walls,
-    pipe_bounds,
-    simulate_board,
-    simulate_particles,
-    simulate_white,
-)
+from lfpiv_cli.synthetic.scenes import Box, Motion, RecordingCamera, Tracers, channel_walls, simulate_particles
 
 AIR = ObjectSpace(Media())
 NOISELESS = Readout(None, 0.0, 96.0)
@@ -50,7 +40,7 @@ def test_boxes_and_windows_of_a_channel(table2, water, camera):
     assert fluid_path_to_focus(window, table2.focus_distance_mm, water) - 0.4655 == pytest.approx(5.0)
     # by hand: 200 - 5/1.49 - 5.4655/1.33 = 200 - 3.355705 - 4.109398
     assert window.distance_mm == pytest.approx(192.534897, abs=1e-6)
-    found = Misalignment(0.12, (3.4, -2.1), 2e-5).apply(camera)
+    found = scenes.Misalignment(0.12, (3.4, -2.1), 2e-5).apply(camera)
     # the lens on the axis goes to 3.4 px and -2.1 px of 0.0055 mm
     assert found.lattice.origin == pytest.approx([0.0187, -0.01155])
     assert np.rad2deg(found.lattice.rotation_rad) == pytest.approx(0.12)
@@ -58,13 +48,13 @@ def test_boxes_and_windows_of_a_channel(table2, water, camera):
 
 
 def test_white_image_and_board_have_light_dark_and_truth(small, rng):
-    camera = Misalignment(0.3, (2.0, -1.0)).apply(small)
-    still = simulate_white(RecordingCamera(camera, NOISELESS), 1000.0, rng)
+    camera = scenes.Misalignment(0.3, (2.0, -1.0)).apply(small)
+    still = scenes.simulate_white(RecordingCamera(camera, NOISELESS), 1000.0, rng)
     assert (still.image.max(), still.dark.min(), still.dark.max()) == (1096, 96, 96)
     assert still.truth["rotation_deg"] == pytest.approx(0.3)
     assert still.truth["pitch_px"] == pytest.approx([18.2545, 18.2545], abs=1e-4)
     board = BoardGeometry((1, 1), 1.0, 0.2)
-    still = simulate_board(
+    still = scenes.simulate_board(
         RecordingCamera(small, NOISELESS), AIR, board, BoardPlacement(-0.35, (0.1, 0.05)), 1000.0, rng
     )
     assert still.truth["dots_mm"] == [pytest.approx([0.1, 0.05, -0.35])]
@@ -185,7 +175,7 @@ def test_tracers_fill_the_box_and_come_into_the_light_and_leave_it(small, rng):
 def test_tracers_fill_a_pipe_and_go_round_in_circles(rng):
     for axis, half_mm in (("x", 1.0), ((1.0, 0.05, 0.0), 4.0)):
         pipe = RoundWall(2.0, (0.0, 0.5, -0.4), axis)
-        box = Box((-half_mm, -9.0, -9.0), (half_mm, 9.0, 9.0)).within(pipe_bounds(pipe))
+        box = Box((-half_mm, -9.0, -9.0), (half_mm, 9.0, 9.0)).within(scenes.pipe_bounds(pipe))
         places = Tracers(4000, box, walls=pipe).draw_places(rng)
         assert places.shape == (4000, 3)
         share = (pipe.distances_mm(places) / 2.0) ** 2

@@ -11,19 +11,7 @@ from lfpiv_cli.fields import stencils
 from lfpiv_cli.fields.evidence import first_expectation, most_probable
 from lfpiv_cli.fields.fit import FEW_SAMPLES, Field, fit_field
 from lfpiv_cli.fields.spline_field import SplineField, lattice_for
-from lfpiv_cli.fields.stencils import (
-    DIVERGENCE,
-    SECOND,
-    SECOND_IN_DEPTH,
-    SMOOTHNESS,
-    THIRD,
-    THIRD_IN_DEPTH,
-    Expectation,
-    Lattice,
-    bound,
-    expected_inverse,
-    factorised,
-)
+from lfpiv_cli.fields.stencils import DIVERGENCE, SECOND, SECOND_IN_DEPTH, SMOOTHNESS, Expectation, Lattice, bound
 from lfpiv_cli.fields.structure import Samples, belonging, with_places, without_itself
 
 LATTICE = Lattice((-1.0, 0.5, 2.0), (0.5, 0.7, 0.6), (4, 2, 1))
@@ -111,11 +99,11 @@ def test_smoothness_does_not_see_polynomials_of_lower_degree(order: int, free: i
         coefficients = np.linalg.lstsq(design, values, rcond=None)[0]
         assert (coefficients @ dense @ coefficients > 1e-6) == sees
     # Expectations add up.
-    weights = {SECOND: 2.0, THIRD: 3.0, SECOND_IN_DEPTH: 2.0, THIRD_IN_DEPTH: 3.0, DIVERGENCE: 5.0}
+    weights = {SECOND: 2.0, stencils.THIRD: 3.0, SECOND_IN_DEPTH: 2.0, stencils.THIRD_IN_DEPTH: 3.0, DIVERGENCE: 5.0}
     expected = Expectation(weights, 0.5, 1.0, 0.0)
     whole = bound(LATTICE, 0.5) + 5.0 * stencils.divergence(LATTICE)
     stencils.add_scalar(whole, 1.0, 2.0 * stencils.smoothness(LATTICE, 2) + 3.0 * stencils.smoothness(LATTICE, 3))
-    np.testing.assert_allclose(expected_inverse(LATTICE, expected), whole, rtol=1e-12)
+    np.testing.assert_allclose(stencils.expected_inverse(LATTICE, expected), whole, rtol=1e-12)
 
 
 def test_normal_equations_are_those_of_the_design_and_compiled_loops_the_interpreted_ones() -> None:
@@ -145,7 +133,7 @@ def test_the_factor_solves_and_knows_its_inverse() -> None:
     points = drawn(rng, 60, lattice)
     stencils.add_samples(matrix, lattice, points, covariances(rng, 60))
     dense = stencils.dense(matrix)
-    factor = factorised(matrix)
+    factor = stencils.factorised(matrix)
     right = rng.normal(size=len(dense))
     np.testing.assert_allclose(dense @ factor.solve(right), right, atol=1e-9)
     inverse = np.linalg.inv(dense)

@@ -20,15 +20,8 @@ from lfpiv_cli.flow.correlation import correlate
 from lfpiv_cli.flow.field import MASKED
 from lfpiv_cli.flow.windows import CorrelationSettings, WindowLayout, layout_windows
 from lfpiv_cli.grid import Grid, Reference
-from lfpiv_cli.verbs.checks import (
-    Quality,
-    calibration_notices,
-    field_notices,
-    pair_notices,
-    quality_of,
-    quality_of_all,
-    tracers_per_window,
-)
+from lfpiv_cli.verbs import checks
+from lfpiv_cli.verbs.checks import Quality, calibration_notices, field_notices, pair_notices, tracers_per_window
 from tests.commands import CONFIG, run, sample_rig, told
 
 SHAPE = (30, 22, 40)
@@ -174,7 +167,7 @@ def test_volumes_that_are_no_pair_or_of_different_calibrations_are_told(rng: np.
         ((one, other), ["volumes-unlike"]),
     ):
         field = correlate([pair], grid, settings)
-        assert [each.code for each in pair_notices(field, quality_of(field), "v")] == codes
+        assert [each.code for each in pair_notices(field, checks.quality_of(field), "v")] == codes
     assert calibration_notices({"a": made_with("1"), "b": made_with("1", "x"), "c": {}}) == []
     assert calibration_notices({"a": {}, "b": {}}) == []
     for other in (made_with("2"), made_with("", "x")):
@@ -185,7 +178,7 @@ def test_volumes_that_are_no_pair_or_of_different_calibrations_are_told(rng: np.
     assert list(field_notices(good, "v")) == []
     assert [each.code for each in field_notices(replace(good, without=60), "v")] == ["no-uncertainty"]
     assert [each.code for each in field_notices(replace(good, in_doubt=60), "v")] == ["vectors-in-doubt"]
-    nothing = quality_of_all([]).summary()
+    nothing = checks.quality_of_all([]).summary()
     assert nothing == {"uncertainty_voxel_median": None, "without_uncertainty_share": None, "in_doubt_share": None}
     volume = np.zeros((10, 10, 10), np.float32)
     volume[1::3, 1::3, 1::3] = 1.0

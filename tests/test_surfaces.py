@@ -9,22 +9,12 @@ from numpy.typing import NDArray
 
 from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.names import Facing, SurfaceKind
+from lfpiv_cli.optics import surfaces
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.curved_space import CurvedSpace, Face
 from lfpiv_cli.optics.media import Media
 from lfpiv_cli.optics.shapes import HeightMap, Vector
-from lfpiv_cli.optics.surfaces import (
-    SURFACES,
-    Cylinder,
-    Faces,
-    Plane,
-    Sphere,
-    Surface,
-    TiltedPlane,
-    height_behind,
-    meet,
-    normal_change,
-)
+from lfpiv_cli.optics.surfaces import SURFACES, Cylinder, Faces, Plane, Sphere, Surface, TiltedPlane, meet
 from lfpiv_cli.optics.tracing import disc_points
 
 PLANE = Plane(-3.0)
@@ -107,7 +97,7 @@ def test_a_line_meets_a_surface_from_both_sides(surface: Surface, table2: Camera
     vertex = np.array(surface.shape().vertex_mm)
     points = vertex + rng.uniform(-4, 4, (200, 3))
     expected = [distance_beyond(surface, point) > 0.0 for point in points]
-    assert [height_behind(faces.reliefs, faces, 0, tuple(point)) > 0.0 for point in points] == expected
+    assert [surfaces.height_behind(faces.reliefs, faces, 0, tuple(point)) > 0.0 for point in points] == expected
     assert len(set(expected)) == 2
 
 
@@ -125,7 +115,7 @@ def test_the_normal_changes_along_a_surface(surface: Surface, table2: Camera) ->
         shift, change = (places[2] - places[0]) / step, (normals[2] - normals[0]) / step
         # of second order in a step of 1e-4 mm beside radii of 6 mm, and roundings of 1e-15 over it
         np.testing.assert_allclose(
-            normal_change(faces.reliefs, faces, 0, tuple(places[1]), tuple(shift)), change, atol=3e-10
+            surfaces.normal_change(faces.reliefs, faces, 0, tuple(places[1]), tuple(shift)), change, atol=3e-10
         )
 
 

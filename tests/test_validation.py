@@ -15,28 +15,12 @@ from lfpiv_cli.files.vtkhdf import write_volume
 from lfpiv_cli.grid import Grid, Reference
 from lfpiv_cli.optics.camera import Lattice
 from lfpiv_cli.optics.tracing import ObjectSpace
+from lfpiv_cli.validation import volume as of_volume
+from lfpiv_cli.validation import weights
 from lfpiv_cli.validation.board import DEPTH_DEFINITIONS, board_figures, elongation_mm, gaussian_centre_mm, measure_dots
 from lfpiv_cli.validation.flow import limits_missed
-from lfpiv_cli.validation.volume import (
-    known_volume,
-    match,
-    near_a_particle,
-    normalised_correlation,
-    particle_figures,
-    shared_among_voxels,
-    volume_figures,
-)
-from lfpiv_cli.validation.weights import (
-    GREY_LEVELS,
-    WINDOW_RADIUS_PX,
-    Column,
-    columns_figure,
-    compare_columns,
-    make_columns,
-    similarity_figure,
-    ssim,
-    weights_figures,
-)
+from lfpiv_cli.validation.volume import known_volume, match, normalised_correlation, particle_figures, volume_figures
+from lfpiv_cli.validation.weights import GREY_LEVELS, WINDOW_RADIUS_PX, Column, make_columns, ssim, weights_figures
 from tests.commands import CONFIG, run, table2_rig
 
 TABLE2 = Path(__file__).parent.parent / "configs" / "table2.yaml"
@@ -143,13 +127,13 @@ def test_a_gaussian_particle_and_ghosts_are_counted_as_they_were_put(particles):
     # cut at 4.3 standard deviations along each axis, where 1e-4 is left
     np.testing.assert_allclose(volume, 3.0 * np.exp(-0.5 * exponent), atol=3.5e-4)
     place = np.array([[0.23, -0.11, 0.4]])
-    volume = shared_among_voxels(GRID, place, np.array([3.0]))
+    volume = of_volume.shared_among_voxels(GRID, place, np.array([3.0]))
     assert volume.sum() == pytest.approx(3.0, rel=1e-6)
     at = np.argwhere(volume)
     centre = (volume[tuple(at.T)][:, np.newaxis] * at[:, ::-1]).sum(axis=0) / 3.0
     np.testing.assert_allclose(GRID.voxel_to_mm(centre), place[0], atol=1e-6)
-    assert not shared_among_voxels(GRID, np.array([[9.0, 0.0, 0.0]]), np.array([3.0])).any()
-    near = near_a_particle(GRID, np.array([[0.05, 0.05, 0.05]]), 0.11)
+    assert not of_volume.shared_among_voxels(GRID, np.array([[9.0, 0.0, 0.0]]), np.array([3.0])).any()
+    near = of_volume.near_a_particle(GRID, np.array([[0.05, 0.05, 0.05]]), 0.11)
     # within 0.11 mm laterally: the voxel and its four neighbours; within 0.44 in depth: four up and down
     assert near[20].sum() == 5
     assert near[:, 12, 15].sum() == 9
@@ -264,7 +248,7 @@ def test_ssim_eq_16_and_figures_of_a_column_by_hand(rng):
     assert normalised_correlation(volume, np.zeros_like(volume)) == 0.0
     reference = np.array([[0.5, 0.25], [0.25, 0.0]])
     image = np.array([[0.5, 0.25], [0.15, 0.1]])
-    figures = compare_columns(reference, image)
+    figures = weights.compare_columns(reference, image)
     assert figures["l1"] == pytest.approx(0.2)
     assert figures["rmse_grey"] == pytest.approx(510.0 * np.sqrt(0.02 / 4))
     figures = {"a.ssim_smallest": 0.9, "a.l1_mean": 0.02}
@@ -340,11 +324,11 @@ def test_curves_of_the_similarity_are_told_apart_and_columns_have_axes() -> None
     pytest.importorskip("matplotlib")
     names = [f"comparison_{k}" for k in range(9)]
     voxel = {name: {"ssim": 0.9, "rmse_grey": 1.0, "l1": 0.1} for name in names}
-    figure = similarity_figure({"voxels": [voxel], "unknown": None} | dict.fromkeys(names, {"l1_mean": 0.1}), 1)
+    figure = weights.similarity_figure({"voxels": [voxel], "unknown": None} | dict.fromkeys(names, {"l1_mean": 0.1}), 1)
     looks = {(line.get_color(), line.get_marker(), line.get_linestyle()) for line in figure.axes[0].lines}
     assert len(looks) == 9
     assert [text.get_text() for text in figure.legends[0].get_texts()] == [name.replace("_", " ") for name in names]
     images = {"ert": np.eye(3), "factorised": 0.5 * np.eye(3)}
-    columns = columns_figure([Column((0.0, 0.0, 1.0), images)]).axes[:2]
+    columns = weights.columns_figure([Column((0.0, 0.0, 1.0), images)]).axes[:2]
     assert [axes.get_xlabel() for axes in columns] == ["column (px)"] * 2
     assert len({axes.images[0].get_clim() for axes in columns}) == 1

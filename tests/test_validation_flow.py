@@ -12,17 +12,8 @@ from lfpiv_cli.flow.field import REJECTED, VALID, VectorField
 from lfpiv_cli.flow.windows import RoundWall
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.synthetic.flows import pipe, shear, square_duct
-from lfpiv_cli.validation.flow import (
-    Duct,
-    Measured,
-    cumulative_distribution,
-    flow_figures,
-    pipe_figures,
-    relative_errors,
-    streamwise_mean_error_at,
-    table_4,
-    truth_at_points,
-)
+from lfpiv_cli.validation import flow as of_flow
+from lfpiv_cli.validation.flow import Duct, Measured, cumulative_distribution, flow_figures, truth_at_points
 from lfpiv_cli.validation.methods import lower_error
 
 SHAPE = (4, 3, 5)
@@ -89,7 +80,7 @@ def test_components_are_in_their_own_voxels_and_slices_between_planes(
     np.testing.assert_allclose(slices["x"]["streamwise_mean_error"], [0.2, 0.0, 0.0, 0.0, 0.0], atol=1e-12)
     np.testing.assert_allclose(slices["x"]["position_mm"], [0.0, 0.8, 1.6, 2.4, 3.2])
     # Half-way between the planes of 0.1 (measured 0.12) and 0.2 m/s.
-    assert streamwise_mean_error_at(Measured(field, truth, inside), 0, 0.4) == pytest.approx(0.32 / 0.3 - 1.0)
+    assert of_flow.streamwise_mean_error_at(Measured(field, truth, inside), 0, 0.4) == pytest.approx(0.32 / 0.3 - 1.0)
 
 
 def test_shares_of_streamwise_and_full_vectors_differ_and_meet_the_cumulative_distribution(
@@ -133,7 +124,7 @@ def test_misses_lower_the_shares(truth: NDArray[np.float64], inside: NDArray[np.
     measured[0, 0, 1] = 0.125
     measured[0, 0, 2] = np.nan
     pairs = Measured(field_of(truth), truth, np.ones(SHAPE, bool)).pairs
-    streamwise, vector = relative_errors(replace(pairs, measured=measured.reshape(-1, 3)))
+    streamwise, vector = of_flow.relative_errors(replace(pairs, measured=measured.reshape(-1, 3)))
     for errors in (streamwise, vector):
         assert errors is not None
         np.testing.assert_array_equal(errors[:4], [0.0, np.inf, np.inf, 0.0])
@@ -164,7 +155,7 @@ def test_table_4_takes_the_paper_s_slices_of_a_duct() -> None:
     everywhere = np.ones(truth.shape[:3], dtype=np.bool_)
     field = replace(field_of(truth), grid=grid, displacement_voxel=measured * DT_S / (np.array(VOXEL_MM) * 1e-3))
     duct = Duct(10.0, (0.0, 0.0, -1.0), "x", 0.1082)
-    table = table_4(Measured(field, truth, everywhere), duct)
+    table = of_flow.table_4(Measured(field, truth, everywhere), duct)
     assert table["overall"]["ours_percent"] == pytest.approx(0.0, abs=1e-9)
     for share in (0.3, 0.54, 0.78):
         assert table[f"z/D {share}"]["ours_percent"] == pytest.approx(20.0 * abs(share - 0.5))
@@ -199,7 +190,7 @@ def test_a_pipes_figures_go_by_the_distance_from_its_axis() -> None:
     measured[10, 16, 1] = np.nan
     field = replace(field_of(truth), grid=grid, displacement_voxel=measured * DT_S / (np.array(VOXEL_MM) * 1e-3))
     inside = truth.any(axis=-1)
-    found = pipe_figures(Measured(field, truth, inside), wall)
+    found = of_flow.pipe_figures(Measured(field, truth, inside), wall)
     rings = {tuple(ring["radius_shares"]): ring for ring in found["rings"]}
     assert rings[0.0, 0.3]["streamwise_mean_error"] == pytest.approx(0.02)
     assert rings[0.3, 0.5]["streamwise_mean_error"] == pytest.approx(0.0)

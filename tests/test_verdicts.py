@@ -7,16 +7,8 @@ from typing import Any
 import numpy as np
 
 from lfpiv_cli.flow.field import MASKED, REJECTED
-from lfpiv_cli.verbs.checks import (
-    FOR_INFORMATION,
-    WORTHLESS,
-    Line,
-    of_two_ways,
-    of_vectors,
-    of_warnings,
-    worst,
-    worst_first,
-)
+from lfpiv_cli.verbs import checks
+from lfpiv_cli.verbs.checks import FOR_INFORMATION, Line, of_two_ways, of_vectors, of_warnings, worst, worst_first
 from tests.vector_fields import SHAPE, SIGMA_VOXEL, VOXEL_MM, field_of, noise_mm, rotation_mm
 
 TROUBLESHOOTING = Path(__file__).parents[1] / "docs" / "troubleshooting.md"
@@ -51,7 +43,7 @@ def test_warnings_count_for_the_part_that_their_command_makes() -> None:
     assert [each.reason for each in worst_first(lines, "images")] == ["dark", "dim", "fine"]
     assert (worst(lines), worst([])) == ("no", "unknown")
     documented = set(re.findall(r"^\| `([a-z-]+)` \|", TROUBLESHOOTING.read_text(encoding="utf-8"), re.MULTILINE))
-    assert documented >= WORTHLESS | FOR_INFORMATION
+    assert documented >= checks.WORTHLESS | FOR_INFORMATION
 
 
 def test_vectors_as_good_as_they_state_and_not() -> None:
