@@ -28,7 +28,7 @@ from lfpiv_cli.names import Refraction
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.curved_space import CurvedSpace
 from lfpiv_cli.optics.media import Media, Window, channel_window
-from lfpiv_cli.optics.surfaces import SURFACES
+from lfpiv_cli.optics.surfaces import SURFACES, Surface
 from lfpiv_cli.optics.tracing import ObjectSpace
 from lfpiv_cli.reconstruction.registry import SOLVERS
 from lfpiv_cli.reconstruction.solvers import SolverSettings, Stopping
@@ -217,8 +217,9 @@ class Config:
         resolved, kinds = self.resolved(), {surface: kind for kind, surface in SURFACES.items()}
         resolved["scene"] = []
         for section in scene:
-            surface: Any = section.model(self.media_model()).surface.moved(motion)
-            resolved["scene"].append({"kind": kinds[type(surface)], **asdict(surface), "behind": section.behind})
+            surface: Surface = section.model(self.media_model()).surface
+            moved: Any = surface.moved(motion)
+            resolved["scene"].append({"kind": kinds[type(moved)], **asdict(moved), "behind": section.behind})
         if self.pipe is not None:
             axis = motion.direction(self.pipe.wall().direction.tolist())
             resolved["pipe"] |= {"centre_mm": motion.point(self.pipe.centre_mm), "axis": axis}
