@@ -163,53 +163,52 @@ class Console:
         return sys.stderr.isatty()
 
 
+@dataclass
 class Frames:
-    """The frames of a batch as they are worked on."""
+    """So many frames of a batch, of how many steps each, as they are worked on; `draw` shows them in place of lines."""
 
-    def __init__(
-        self,
-        console: Console,
-        total: int,
-        steps: float,
-        label: str,
-        unit: str,
-        draw: Callable[[float], None] | None = None,
-    ) -> None:
-        """Take how many there are, of how many steps each; `draw` shows how many are done, in place of lines."""
-        self.console, self._draw = console, draw
-        self._total, self._steps, self._label, self._unit = total, steps, label, unit
-        self._begun, self._done, self._part = time.monotonic(), 0, 0.0
-        self._told = self._begun
+    console: Console
+    total: int
+    steps: float
+    label: str
+    unit: str
+    draw: Callable[[float], None] | None = None
+    _done: int = 0
+    _part: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Begin."""
+        self._begun = self._told = time.monotonic()
 
     def advance(self, steps: float) -> None:
         """Take so many steps in the frame that is worked on."""
-        self._part = min(self._part + steps / self._steps, 1.0)
-        if self._draw is not None:
-            self._draw(self._done + self._part)
+        self._part = min(self._part + steps / self.steps, 1.0)
+        if self.draw is not None:
+            self.draw(self._done + self._part)
         elif time.monotonic() - self._told >= SECONDS_WITHIN_FRAME:
             self._told = time.monotonic()
-            self.console.say(f"{self._label}: {self._done + self._part:.1f} of {self._total} {self._unit}s")
+            self.console.say(f"{self.label}: {self._done + self._part:.1f} of {self.total} {self.unit}s")
 
     def done(self, name: str) -> None:
         """Count a frame that is complete, or given up."""
         self._done, self._part, self._told = self._done + 1, 0.0, time.monotonic()
         each = (time.monotonic() - self._begun) / self._done
-        left = each * (self._total - self._done)
+        left = each * (self.total - self._done)
         self.console.event(
             "frame",
-            step=self._label,
+            step=self.label,
             name=name,
             done=self._done,
-            of=self._total,
+            of=self.total,
             seconds_each=round(each, 3),
             seconds_left=round(left, 3),
             memory_mb=largest_memory_mb(),
         )
-        if self._draw is not None:
-            self._draw(self._done)
+        if self.draw is not None:
+            self.draw(self._done)
         else:
-            count = f"{self._done} of {self._total} {self._unit}s"
-            self.console.say(f"{self._label}: {name}, {count}, {written(each)} s each, {_duration(left)} left")
+            count = f"{self._done} of {self.total} {self.unit}s"
+            self.console.say(f"{self.label}: {name}, {count}, {written(each)} s each, {_duration(left)} left")
 
 
 # For those who call a stage from Python and say nothing of it.

@@ -22,18 +22,10 @@ from threadpoolctl import threadpool_limits
 
 from lfpiv_cli.arrays import Flags, Floats, Singles
 from lfpiv_cli.errors import ConfigError, InputError
+from lfpiv_cli.flow import outliers
 from lfpiv_cli.flow.deformation import Spline, deform_pair, matrices_to_voxels, spline_coefficients, spline_matrix
 from lfpiv_cli.flow.field import VectorField
 from lfpiv_cli.flow.moments import MOMENTS, gauss_newton, pair_moments
-from lfpiv_cli.flow.outliers import (
-    expected_noise,
-    fill_field,
-    in_tails,
-    mixing,
-    smooth_field,
-    unresolved,
-    validate_vectors,
-)
 from lfpiv_cli.flow.peaks import ELONGATED_WIDTH, Peaks, absolute, find_peaks, typical_width, undiluted
 from lfpiv_cli.flow.sums import MapSums, map_sums, margins, valid_shares
 from lfpiv_cli.flow.windows import CorrelationSettings, Triple, WindowLayout, cells_of, triple
@@ -90,14 +82,16 @@ class Coarse:
         peaks = find_peaks(sums.correlation())
         raw, second = absolute(peaks, np.zeros(peaks.offset.shape))
         nowhere = np.zeros(peaks.found.shape, dtype=np.bool_)
-        displacement, _ = validate_vectors(raw, second, peaks.found, nowhere, expected_noise(peaks.width))
+        displacement, _ = outliers.validate_vectors(
+            raw, second, peaks.found, nowhere, outliers.expected_noise(peaks.width)
+        )
         width = undiluted(typical_width(peaks.width) * np.asarray(self.bins))
         is_elongated = bool(np.any(width >= ELONGATED_WIDTH))
         size, step, first = (
             triple(n * width for n, width in zip(cells, self.bins, strict=True))
             for cells in (self.layout.size, self.layout.step, self.layout.first)
         )
-        found = smooth_field(fill_field(displacement), is_elongated) * np.asarray(self.bins)
+        found = outliers.smooth_field(outliers.fill_field(displacement), is_elongated) * np.asarray(self.bins)
         return found, WindowLayout(size, step, self.layout.count, first), is_elongated
 
 
@@ -214,12 +208,12 @@ def correlate(
                 predictor = np.einsum("ck,bj,ai,kjid->cbad", z, y, x, predictor, optimize=True)
             measured = _refine(ready, predictor, step, is_elongated)
             is_long = measured.width >= ELONGATED_WIDTH
-            filled, is_elongated = fill_field(measured.displacement), bool(is_long.any())
-            predictor = smooth_field(filled, is_elongated)
+            filled, is_elongated = outliers.fill_field(measured.displacement), bool(is_long.any())
+            predictor = outliers.smooth_field(filled, is_elongated)
             report(1)
     # Long particles mix the flow into the components that are located well; along their length noise is worse.
     sigma = np.where(is_long, measured.width / np.sqrt(2.0), 0.0)
-    mixed = np.where(is_long, 0.0, mixing(filled, sigma, layout.step))
+    mixed = np.where(is_long, 0.0, outliers.mixing(filled, sigma, layout.step))
     return VectorField(
         grid=layout.grid(grid),
         displacement_voxel=measured.displacement - mixed,
@@ -228,7 +222,7 @@ def correlate(
         peak_ratio=measured.peaks.ratio,
         valid_fraction=measured.valid_fraction,
         flag=measured.flag,
-        uncertainty_voxel=np.hypot(measured.uncertainty, unresolved(filled, is_elongated)),
+        uncertainty_voxel=np.hypot(measured.uncertainty, outliers.unresolved(filled, is_elongated)),
         voxel_mm=grid.spacing_mm,
         dt_s=settings.dt_s,
         window_voxel=layout.size,
@@ -307,7 +301,7 @@ def _refine(pairs: Sequence[Pair], predictor: Floats, step: Pass, is_elongated: 
     elongated = width >= ELONGATED_WIDTH
     if step.is_last:
         amplitude = total.amplitude() / np.sqrt(np.maximum(valid_fraction, SMALLEST_VALID_FRACTION))
-        tails = in_tails(amplitude, np.where(elongated, width / np.sqrt(2.0), 0.0), layout)
+        tails = outliers.in_tails(amplitude, np.where(elongated, width / np.sqrt(2.0), 0.0), layout)
         peaks = replace(peaks, height=np.where(tails, 0.0, peaks.height))
     rest = uncertainty = np.full(peaks.offset.shape, np.nan)
     if moments_of[0] is not None:
@@ -322,7 +316,9 @@ def _refine(pairs: Sequence[Pair], predictor: Floats, step: Pass, is_elongated: 
     offset = np.where(share > 0.0, peaks.offset + share * differ, peaks.offset)
     raw, second = absolute(replace(peaks, offset=offset), predictor)
     masked = valid_fraction < SMALLEST_VALID_FRACTION
-    displacement, flag = validate_vectors(raw, second, peaks.found, masked, expected_noise(peaks.width))
+    displacement, flag = outliers.validate_vectors(
+        raw, second, peaks.found, masked, outliers.expected_noise(peaks.width)
+    )
     uncertainty[~peaks.found | masked] = np.nan
     return Measured(raw, displacement, flag, peaks, valid_fraction, uncertainty, width)
 

@@ -20,7 +20,6 @@ from lfpiv_cli.files.hdf5 import unpacked_bytes
 from lfpiv_cli.files.inputs import ensure_room
 from lfpiv_cli.files.particle_file import Points, symmetric
 from lfpiv_cli.files.provenance import record
-from lfpiv_cli.files.sections import NM_TO_MM
 from lfpiv_cli.files.weights_file import WeightsFile, open_weights
 from lfpiv_cli.notice import Notice, warn_of
 from lfpiv_cli.optics.curved_space import CurvedSpace
@@ -229,19 +228,19 @@ def _size_of(
     return TracerSize(given or measured, measured, lens_mm * found.sigma_lenses, found.resolved, diffusion)
 
 
-def find(bench: Bench, frame: Frame, progress: Callable[[int], None] | None = None) -> Particles:
+def find(bench: Bench, frame: Frame, progress: Progress | None = None) -> Particles:
     """Return the particles behind an image."""
     task = task_for(bench, frame)
     return result(task, first_pass(task, progress=progress))
 
 
-def find_first(bench: Bench, frame: Frame, progress: Callable[[int], None] | None = None) -> Floats:
+def find_first(bench: Bench, frame: Frame, progress: Progress | None = None) -> Floats:
     """Return the particles (n, 4) of a frame's first pass, for its own second pass and those of its neighbours."""
     return first_pass(task_for(bench, frame), progress=progress).particles
 
 
 def find_second(
-    bench: Bench, frame: Frame, before: Frame, particles: Floats, progress: Callable[[int], None] | None = None
+    bench: Bench, frame: Frame, before: Frame, particles: Floats, progress: Progress | None = None
 ) -> Floats:
     """Return what `find_first` returns, for the second frame of a pair: with those (n, 4) of the first, `before`."""
     task = task_for(bench, frame)
@@ -289,11 +288,8 @@ def _view(bench: Bench, waves: Light | None) -> View:
 
 def light_of(settings: Config, depths_mm: tuple[float, float]) -> Light | None:
     """Return the light as waves, as it is fitted between two depths; None: by rays."""
-    chosen = settings.reconstruction
-    if chosen.wavelength_nm is None:
-        return None
-    diffusion_px = USUAL_DIFFUSION_PX if chosen.diffusion_px is None else chosen.diffusion_px
-    return Light(chosen.wavelength_nm * NM_TO_MM, diffusion_px, depths_mm)
+    waves = settings.reconstruction.wave_light()
+    return None if waves is None else Light(waves.wavelength_mm, waves.diffusion_px, depths_mm)
 
 
 def points_of(bench: Bench, frame: Frame, found: Particles, size: TracerSize, provenance: Mapping[str, Any]) -> Points:
@@ -383,29 +379,30 @@ def tracers_per_lens(bench: Bench, frame: Frame) -> float | None:
     return counted(task_for(replace(bench, settings=settings), frame), bench.lens_images.lattice_px)
 
 
+@dataclass(eq=False)
 class Finder:
     """Finds the particles of frames, alone or with the first passes of those beside them.
 
     That of the second frame of a pair begins with what the first frame's found, never the other way round: so it does
     not matter which frames are there already.
+
+    Attributes
+    ----------
+    bench, read : what frames share, and what reads one
+    beside : the numbers of those beside each; None: each is found alone
+    first_of : of each second frame of a pair the first
+    keep_going : one of those beside may be unreadable
     """
 
-    def __init__(
-        self,
-        bench: Bench,
-        read: Read,
-        frames: Sequence[ImageFrame],
-        beside: Sequence[tuple[int, ...]] | None,
-        first_of: Mapping[int, int],
-        keep_going: bool,
-    ) -> None:
-        """Take how frames are read, which are beside each, and of each second of a pair the first.
+    bench: Bench
+    read: Read
+    frames: Sequence[ImageFrame]
+    beside: Sequence[tuple[int, ...]] | None
+    first_of: Mapping[int, int]
+    keep_going: bool
 
-        With `keep_going`, one of those beside may be unreadable.
-        """
-        self._bench, self._read, self._frames = bench, read, frames
-        self._beside, self._first_of, self._keep_going = beside, first_of, keep_going
-        # A frame needs itself and one at either side, the next one two of these again.
+    def __post_init__(self) -> None:
+        """Remember a frame and one at either side, two of which the next one needs again."""
         self._first_pass_of: Callable[[int], Floats] = lru_cache(maxsize=3)(self._first_pass)
         self._advance: Progress | None = None
 
@@ -417,33 +414,33 @@ class Finder:
         InputError : one beside it cannot be read, and that is to stop the batch
         """
         self._advance = advance
-        if self._beside is None:
-            return find(self._bench, frame, advance), []
+        if self.beside is None:
+            return find(self.bench, frame, advance), []
         notices, helping = [], []
-        for k in self._beside[number]:
+        for k in self.beside[number]:
             try:
-                if self._keep_going:
+                if self.keep_going:
                     self._frame(k)
                 helping.append(k)
             except InputError as error:
-                text = f"is found without the help of {self._frames[k].stem}: {error}"
-                notices.append(Notice("frame-alone", self._frames[number].stem, text, "mend that one"))
+                text = f"is found without the help of {self.frames[k].stem}: {error}"
+                notices.append(Notice("frame-alone", self.frames[number].stem, text, "mend that one"))
         if not helping:
-            return find(self._bench, frame, advance), notices
+            return find(self.bench, frame, advance), notices
         seen = {k: self._first_pass_of(k) for k in sorted((number, *helping))}
-        return find_beside(self._bench, frame, seen[number], [seen[k] for k in helping]), notices
+        return find_beside(self.bench, frame, seen[number], [seen[k] for k in helping]), notices
 
     def _first_pass(self, number: int) -> Floats:
-        frame, first = self._frame(number), self._first_of.get(number)
+        frame, first = self._frame(number), self.first_of.get(number)
         if first is None:
-            return find_first(self._bench, frame, self._advance)
+            return find_first(self.bench, frame, self._advance)
         before = self._frame(first)
-        return find_second(self._bench, frame, before, self._first_pass_of(first), self._advance)
+        return find_second(self.bench, frame, before, self._first_pass_of(first), self._advance)
 
     def _frame(self, number: int) -> Frame:
-        raw, lit = self._read(number)
-        check_frame(self._bench, raw, str(self._frames[number].path))
-        return frame_of(self._bench, raw, lit)
+        raw, lit = self.read(number)
+        check_frame(self.bench, raw, str(self.frames[number].path))
+        return frame_of(self.bench, raw, lit)
 
 
 class Prepared:

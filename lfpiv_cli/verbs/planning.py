@@ -25,12 +25,12 @@ from lfpiv_cli.notice import written
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media
 from lfpiv_cli.synthetic.flows import MM_PER_M
-from lfpiv_cli.synthetic.render import Readout
 from lfpiv_cli.validation import planning
 from lfpiv_cli.validation.planning import Miniature, Tracer
 from lfpiv_cli.verbs.build_weights import ray_source
 from lfpiv_cli.verbs.checks import Line, Verdict
 from lfpiv_cli.verbs.particles import light_of
+from lfpiv_cli.verbs.simulate import readout_of
 from lfpiv_cli.verbs.weights_cost import TRACER_S, Cost, check_rig, cost_notices, cost_of, rig_notices
 from lfpiv_cli.weights.build import default_padding
 from lfpiv_cli.weights.scene import Source
@@ -132,8 +132,7 @@ class Bench:
     def tracer(self) -> Tracer:
         """Return a tracer as the config simulates it."""
         scene = self.settings.simulation
-        readout = Readout(scene.photons_per_count, scene.read_noise_counts, scene.dark_level_counts, scene.bits)
-        return Tracer(scene.particle_counts, 0.5 * scene.particle_diameter_mm, readout)
+        return Tracer(scene.particle_counts, 0.5 * scene.particle_diameter_mm, readout_of(self.settings))
 
 
 def bench_of(settings: Config, found: Calibration | None, velocity_m_s: float | None = None) -> Bench:

@@ -8,7 +8,7 @@ particles.npz.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -38,6 +38,7 @@ from lfpiv_cli.synthetic.flows import STEADY, Pulsation
 from lfpiv_cli.synthetic.rays import objective_of, unseen
 from lfpiv_cli.synthetic.render import RAYS, Readout, Space
 from lfpiv_cli.synthetic.scenes import Bubbles, bubbles_at_wall, render_bubbles, seeded_boxes
+from lfpiv_cli.verbs.frames import Progress
 from lfpiv_cli.verbs.weights_cost import LONG_S, MUCH_BYTES
 from lfpiv_cli.weights.build import blur_radius_mm
 from lfpiv_cli.weights.scene import spread_mm
@@ -323,12 +324,7 @@ def simulated_reference(settings: Config) -> Reference:
 
 
 def _board_still(
-    settings: Config,
-    board: BoardGeometry,
-    space: Space,
-    z_mm: float,
-    rng: np.random.Generator,
-    progress: Callable[[int], None],
+    settings: Config, board: BoardGeometry, space: Space, z_mm: float, rng: np.random.Generator, progress: Progress
 ) -> scenes.SimulatedStill:
     placement, level = placement_of(settings, z_mm), settings.simulation.peak_counts
     return scenes.simulate_board(_recording(settings), space, board, placement, level, rng, progress)

@@ -26,6 +26,7 @@ from lfpiv_cli.reconstruction.solvers import ALL_ITERATIONS, Reconstruction, nor
 from lfpiv_cli.synthetic.board import BoardPlacement, dot_centres, render_board
 from lfpiv_cli.synthetic.scenes import RecordingCamera, simulate_board, simulate_white
 from lfpiv_cli.validation import board as of_boards
+from lfpiv_cli.verbs.frames import Progress
 from lfpiv_cli.verbs.simulate import misalignment_of, placement_of, readout_of
 from lfpiv_cli.weights.build import factorise_through, scene_distortion
 from lfpiv_cli.weights.columns import operator_of
@@ -72,7 +73,7 @@ class BoardBench:
         return replace(self, weights=replace(self.weights, solver_operator=operator, scene_distortion_per_mm2=None))
 
 
-BoardSolver = Callable[[Singles, Callable[[int], None]], Reconstruction]
+BoardSolver = Callable[[Singles, Progress], Reconstruction]
 
 # Two make a step in depth, a third the polynomials of fitted rays.
 FEWEST_DEPTHS = 3
@@ -102,10 +103,18 @@ def validate_board(
     with console.progress(steps * len(depths), "boards") as advance:
         for half in halves:
             bench = bench_of(settings, half)
+            board = bench.rig.board
             pictures = [bench.picture(placement_of(settings, depth)) for depth in depths]
             for method in chosen.methods:
                 if method == "discs":
-                    figures[half][method] = _discs(bench, pictures, depths, advance)
+                    # The errors of place of dots that are fitted to the pictures as discs.
+                    calibration, places = bench.weights.calibration, []
+                    rotation = 0.0 if calibration is None else calibration.rectification.rotation_rad
+                    for picture in pictures:
+                        places.append(dots_in_world(picture, bench.rig.camera, board, bench.rig.media, rotation))
+                        advance(1)
+                    x, z = ([each[..., axis] for each in places] for axis in (0, 2))
+                    figures[half][method] = of_boards.place_figures(x, z, depths, board.spacing_mm)
                     continue
                 judged = bench if method == "ert" else bench.with_fitted_rays(pictures, depths)
                 solve, dots = board_solver(judged, settings), []
@@ -114,7 +123,7 @@ def validate_board(
                     dots.append(found)
                     drawn = volume if depth == 0.0 else drawn
                     console.detail(f"board at {depth:+z.0f} mm: residual {residual:z.3f}")
-                measured = of_boards.board_figures(dots, depths, bench.rig.board.dots, bench.rig.board.spacing_mm)
+                measured = of_boards.board_figures(dots, depths, board.dots, board.spacing_mm)
                 figures[half][method] = measured | {"paper": of_boards.PAPER[half, method]}
                 write_picture(
                     drawings[half, method], of_boards.board_figure(measured, drawn, settings.grid()), overwrite
@@ -178,22 +187,8 @@ def bench_of(settings: Config, half: str) -> BoardBench:
     return BoardBench(replace(rig, camera=camera), calibrated, picture, ~calibration.rectification.inside)
 
 
-def _discs(
-    bench: BoardBench, pictures: Sequence[Singles], depths_mm: tuple[float, ...], advance: Callable[[int], None]
-) -> dict[str, Any]:
-    """Return the errors of place of dots that are fitted to the pictures as discs."""
-    calibration, rig = bench.weights.calibration, bench.rig
-    rotation = 0.0 if calibration is None else calibration.rectification.rotation_rad
-    places = []
-    for picture in pictures:
-        places.append(dots_in_world(picture, rig.camera, rig.board, rig.media, rotation))
-        advance(1)
-    x, z = ([each[..., axis] for each in places] for axis in (0, 2))
-    return of_boards.place_figures(x, z, depths_mm, rig.board.spacing_mm)
-
-
 def board_in(
-    bench: BoardBench, solve: BoardSolver, picture: Singles, placement: BoardPlacement, advance: Callable[[int], None]
+    bench: BoardBench, solve: BoardSolver, picture: Singles, placement: BoardPlacement, advance: Progress
 ) -> tuple[of_boards.DotFigures, Singles, float]:
     """Return what is measured of the board in a picture, its volume [z, y, x], and the solver's last residual."""
     board, result = bench.rig.board, solve(picture, advance)
@@ -211,7 +206,7 @@ def board_solver(bench: BoardBench, settings: Config) -> BoardSolver:
     solver = replace(settings.solver_settings(), stopping=ALL_ITERATIONS)
     sums = None if bench.weights.on_demand else normalisers(bench.weights.padded, bench.excluded)
 
-    def solve(picture: Singles, advance: Callable[[int], None]) -> Reconstruction:
+    def solve(picture: Singles, advance: Progress) -> Reconstruction:
         operator = bench.weights.padded.for_image(picture)
         return reconstruct(
             operator, picture, solver, sums=sums or normalisers(operator, bench.excluded), progress=advance
