@@ -64,7 +64,8 @@ def test_flows_are_divergence_free(name, rng):
     # central differences of smooth functions with a step of 1e-3 of the scale: 1e-6 relative, rounding 1e-11
     trace = np.trace(gradient(SOLENOIDAL[name], points, 1e-3), axis1=1, axis2=2)
     assert np.abs(trace).max() < 1e-5
-    assert np.abs(np.trace(SOLENOIDAL[name].gradient(points), axis1=1, axis2=2)).max() < 1e-11
+    # those that it tells of itself are right to rounding
+    assert np.abs(np.trace(SOLENOIDAL[name].gradient(points), axis1=1, axis2=2)).max() < 1e-9
 
 
 @pytest.mark.parametrize("name", [*EXAMPLES, "cellular"])
