@@ -145,10 +145,6 @@ class PressureField:
         flat = coefficients.ravel()
         return np.asarray(np.sum(values * flat[columns], axis=1) - self.mean @ flat)
 
-    def gradient_at(self, points_mm: Floats) -> Floats:
-        """Return the gradients (m, 3) in Pa/mm at points."""
-        return gradient_at(points_mm, self.lattice, self.coefficients)
-
     def variance_at(self, points_mm: Floats) -> Floats:
         """Return the variances (m,) of the pressure less its mean over the box, in Pa^2."""
         found = np.empty(len(points_mm))
