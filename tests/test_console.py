@@ -91,8 +91,8 @@ def test_the_bar_counts_frames(monkeypatch, capsys) -> None:
         work.done("a")
         # More steps than were foreseen are no second frame.
         work.advance(9)
-        assert work._draw is not None
-        work._draw(1.5)
+        assert work.draw is not None
+        work.draw(1.5)
     drawn = capsys.readouterr().err
     assert "/2 frames" in drawn
     assert "a, 1 of 2" not in drawn
