@@ -77,6 +77,17 @@ def test_uneven_haze_is_found_to_some_per_cent(camera: Camera, water: Media, rng
         assert found.level_counts == pytest.approx(np.median(haze), rel=0.06)
 
 
+def test_haze_fainter_than_a_pixel_s_noise_is_found(camera: Camera, water: Media, rng: np.random.Generator):
+    """Over the pixels that a tracer lights it adds up."""
+    camera = replace(camera, columns=400, rows=320)
+    true, white = white_of(camera, rng)
+    for per_lens in (0.05, 0.4, 0.8):
+        found = seen(tracers(camera, water, per_lens, rng) + 12.0 * true, white, rng)
+        assert found is not None
+        # Of noise of 16 counts; known to a fifth of it.
+        assert found.level_counts == pytest.approx(12.0, abs=3.0)
+
+
 @pytest.mark.parametrize("photons_per_count", [0.5, 0.01])
 def test_tracers_are_no_haze_however_many(
     camera: Camera, water: Media, rng: np.random.Generator, photons_per_count: float

@@ -42,8 +42,11 @@ CORE_SIGMAS, SMOOTH_LENSES, ROUNDS = 1.5, 2.0, 12
 # falls to this share of itself at most.
 UNEVENNESS, COOLING = 0.15, 0.7
 # Microlenses of which fewer pixels are dark do not tell; haze has at least so many standard deviations of its noise:
-# of 1.3 to 1.9 tracers for each microlens, without haze, few pixels are dark, and what they have is up to 1.3.
+# of 1.3 to 1.9 tracers for each microlens, without haze, few pixels are dark, and what they have is up to 1.3. Where
+# more than a share of all pixels is dark, as of 0.8 tracers and fewer, it is up to 0.3. Of what is less than a pixel's
+# noise the pixels that a tracer lights have much: with 2 standard deviations depths were 8 % too small.
 LEAST_DARK, LEAST_SIGMAS = 0.05, 2.5
+MUCH_DARK, LEAST_SIGMAS_OF_DARK = 0.15, 0.4
 # Fewer counts are what rounding and a dark level that drifts leave.
 LEAST_COUNTS = 2.0
 # How far below it noise is looked at, and how far to either side texture.
@@ -167,7 +170,9 @@ class White:
             least = float(np.median(-below)) / HALF_NORMAL_MEDIAN if below.size else 0.0
             sigma = max(least, COOLING * sigma, 0.5 * noise)
         middle = float(np.median(haze[self.lenses.of_some(pixels) > 0.0]))
-        if middle <= max(LEAST_SIGMAS * sigma, LEAST_COUNTS):
+        # Noise alone is below the haze as often as above.
+        dark = 2.0 * float(np.mean(rest < 0.0)) > MUCH_DARK
+        if middle <= max((LEAST_SIGMAS_OF_DARK if dark else LEAST_SIGMAS) * sigma, LEAST_COUNTS):
             return None
         near = np.full(picture.shape, np.nan)
         near.ravel()[pixels] = np.where(np.abs(rest) < NEAR_SIGMAS * sigma, rest, np.nan)

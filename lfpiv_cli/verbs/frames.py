@@ -230,9 +230,9 @@ def other_frames(level: Background, frames: Sequence[Frame], mask: str | Path | 
 
 Progress = Callable[[int], None]
 
-# Where more middles of lens images than this share are as dark as between lens images, there is no haze: so many are of
-# one tracer for each microlens, and of haze of three times the noise.
-MOST_DARK = 0.1
+# Where more middles of lens images than this share are within so many standard deviations of what is between lens
+# images, half of them within a quarter of one, there is no haze: so many are of one tracer for each microlens.
+MOST_DARK, DARK_SIGMAS, LEAST_SIGMAS = 0.1, 3.0, 0.25
 # The brightest of some millions of pixels stands 5.2 standard deviations out of normal noise.
 NOISE_SIGMAS = 6.0
 # The name of one in memory.
@@ -286,7 +286,9 @@ class Bench:
             return None
         level, noise = self.lens_images.background(np.where(unusable, np.float32(np.nan), lit))
         column, row = np.clip(np.rint(calibration.fit.centres_px).astype(np.int64), 0, np.array(lit.shape[::-1]) - 1).T
-        if np.mean(np.abs(lit[row, column] - level) < noise) > MOST_DARK:
+        above = lit[row, column] - level
+        dark = above[np.abs(above) < DARK_SIGMAS * noise]
+        if dark.size > MOST_DARK * above.size and np.median(dark) < LEAST_SIGMAS * noise:
             return None
         white = white_of(calibration)
         return None if white is None else white.haze_in(lit, ~unusable, (level, noise))
