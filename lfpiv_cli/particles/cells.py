@@ -8,6 +8,7 @@ Axes: image axes on the array, mm from the lens's centre.
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -168,7 +169,13 @@ def smallest_ball_mm(lattice: Lattice) -> float:
 
 def cell_shares(lattice: Lattice, radius_mm: float) -> CellShares:
     """Return the shares for the cells of a hexagonal lattice and a ball whose image has about this radius."""
-    radius = max(radius_mm, smallest_ball_mm(lattice))
+    return _cell_shares(lattice.basis.tobytes(), max(radius_mm, smallest_ball_mm(lattice)))
+
+
+@lru_cache(maxsize=4)
+def _cell_shares(basis: bytes, radius: float) -> CellShares:
+    """Return `cell_shares`, of which all images of a camera ask for the same."""
+    lattice = Lattice(np.zeros(2), np.frombuffer(basis).reshape(2, 2), "hexagonal")
     step, pitch = radius / ENTRIES_PER_RADIUS, float(lattice.pitch.max())
     steps = max(int(np.ceil(np.log(pitch / (FIRST_SIDE * radius)) / np.log(NEXT_SIDE))), 0)
     sides = np.array([0.0, *(FIRST_SIDE * radius * NEXT_SIDE**n for n in range(steps)), pitch])
