@@ -382,6 +382,7 @@ def told_of(**measured: object) -> list[Notice]:
         ({"residual": 0.11}, "light-model", "give reconstruction.wavelength_nm"),
         ({"residual": 0.19, "residual_alike": 0.02}, None, ""),
         ({"residual": 0.09, "residual_alike": 0.4}, None, ""),
+        ({"residual": 0.18, "residual_alike": 0.4, "residual_lit": 0.03}, None, ""),
         (
             {"residual": 0.09, "residual_alike": 0.6},
             "light-model",

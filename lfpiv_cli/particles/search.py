@@ -122,7 +122,8 @@ class Particles:
     ambiguous : (n,) whether another depth explains its light about as well
     beyond : (n,) whether it ends at the first or last depth that it may have: it lies there or further out
     residual : (rows, columns) what the particles leave of the image, counts
-    alike : share of it that is alike in pixels side by side where particles light them, as noise is not
+    left, alike : share of the light that it is where particles light pixels, and of that what is alike in pixels side
+        by side, as noise is not
     noise : of the image
     """
 
@@ -135,6 +136,7 @@ class Particles:
     ambiguous: NDArray[np.bool_]
     beyond: NDArray[np.bool_]
     residual: Floats
+    left: float
     alike: float
     noise: Noise
 
@@ -430,6 +432,7 @@ def result(task: Task, state: State) -> Particles:
         ambiguous=ambiguous,
         beyond=beyond,
         residual=state.residual.reshape(shape),
+        left=share,
         alike=correlation.share,
         noise=state.noise,
     )

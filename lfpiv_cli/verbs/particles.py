@@ -324,6 +324,7 @@ def points_of(bench: Bench, frame: Frame, found: Particles, size: TracerSize, pr
             "refraction": "paraxial" if isinstance(space, ObjectSpace) and space.straight else "exact",
             "light": "rays" if bench.settings.reconstruction.wavelength_nm is None else "waves",
             "residual": share_left,
+            "residual_lit": found.left,
             "residual_alike": found.alike,
             "residual_rms_counts": float(np.sqrt(np.mean(left[~frame.unusable] ** 2))),
             "excluded_pixels": int(np.count_nonzero(frame.unusable)),

@@ -183,7 +183,8 @@ def light_notices(points: Points, name: str) -> list[Notice]:
     crowd = max(found, measured.get("tracers_per_lens", 0.0))
     # Of crowds particles that are none end anywhere.
     beyond = measured.get("beyond_depths", 0.0) if crowd <= LARGEST_CROWD else 0.0
-    alike = measured.get("residual_alike", MUCH_ALIKE)
+    # What lies beside all particles is light of others, as at the sensor's edge, and not the model's.
+    left, alike = min(unexplained, measured.get("residual_lit", 1.0)), measured.get("residual_alike", MUCH_ALIKE)
     if unexplained > LARGEST_UNEXPLAINED:
         against(
             "light-unexplained",
@@ -202,16 +203,16 @@ def light_notices(points: Points, name: str) -> list[Notice]:
             beyond,
             f"at most {MOST_BEYOND:g}",
         )
-    elif (unexplained > MUCH_LEFT and alike > LEAST_ALIKE) or unexplained * np.sqrt(alike) > MUCH_LEFT_ALIKE:
+    elif (left > MUCH_LEFT and alike > LEAST_ALIKE) or left * np.sqrt(alike) > MUCH_LEFT_ALIKE:
         against(
             "light-model",
-            f"{unexplained:.0%} of the light is not that of the particles found by {measured['light']}, and "
+            f"{left:.0%} of the light is not that of the particles found by {measured['light']}, and "
             f"{alike:.0%} of what is left is alike in pixels side by side; at most {MUCH_LEFT:.0%} is left, or "
             "noise, where the model is right and few are missing: stated errors may be too small",
             "give reconstruction.wavelength_nm, as lenses diffract"
             if measured["light"] == "rays"
             else "check the calibration, wavelength_nm and diffusion_px",
-            unexplained,
+            left,
             f"at most {MUCH_LEFT:g}",
         )
     if crowd > LARGEST_CROWD:
