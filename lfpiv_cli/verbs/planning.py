@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -175,6 +175,7 @@ def rig_lines(bench: Bench) -> list[Line]:
         _voxels,
         windows_line,
         _time_step,
+        _believed,
         _cost,
     )
     return [question(bench) for question in questions]
@@ -428,6 +429,21 @@ def _time_step(bench: Bench) -> Line:
         return Line(about, "good", reason)
     beyond = crossed > max(LARGEST_SHARE_OF_WINDOW * coarse, planning.LARGEST_STEP)
     return Line(about, "no" if beyond else "look", f"{reason}; {advice}")
+
+
+def _believed(bench: Bench) -> Line:
+    """Say what one snapshot does not tell of a rig, and how far off depths and velocities are where it is off."""
+    camera, index, known = bench.camera, bench.media.fluid, bench.found is not None and bench.found.pose is not None
+    reasons = [] if known else ["no board tells camera.main_lens.magnification"]
+    if not known:
+        other = replace(camera, magnification=1.01 * camera.magnification).scale(bench.media)
+        across, along = 1.0 - other.lens_mm / bench.scale.lens_mm, 1.0 - other.depth_mm / bench.scale.depth_mm
+        reasons[0] += f" of {camera.magnification:g}: 1% more makes lengths {across:.1%} and depths {along:.1%} smaller"
+    if index != 1.0:
+        reasons.append(f"no snapshot tells media.fluid of {index:g}: 1% more makes depths and w 1% larger")
+    if not reasons:
+        return Line("believed", "good", "the board tells the magnification, and depths need no index")
+    return Line("believed", "unknown", "; ".join([*reasons, "boards at several depths tell both"]))
 
 
 def _cost_of(bench: Bench) -> Cost:
