@@ -42,6 +42,10 @@ DEPTH_UNITS, DEEPEST = (3.0, 8.0), 0.35
 FILLED = 0.8
 # Rays of each tracer, and of all of an image's: where tracers are many, neighbours cost more accuracy than rays' noise.
 RAYS, ALL_RAYS = (8_000, 40_000), 2e7
+# Photons of each of a tracer's rays, as far as its light is more than so many counts and this share of full scale. Rays
+# that fill the aperture evenly err where lens images end, by a quarter of what as many photons would: of more light
+# their errors, not photons, would be the noise, which is of no camera.
+PHOTONS_OF_RAY, LEAST_COUNTS, LEAST_SHARE = 2.0, 12.0, 0.02
 DT_S = 1e-3
 # Hard conditions, each on this share of the rigs. Of a board: how wide its dots are and how far apart at least, in
 # microlenses, and how far off the focal plane it stands, in depth units. Haze in its brightest place, over the
@@ -259,7 +263,8 @@ def _place_behind_a_wall(true: Tree, depth: float, wall: float, to_focus: float,
         return
     media = true["media"]
     distance = to_focus - 0.5 * depth / media["fluid"] - wall / media["window"]
-    true["window"] = {"distance_mm": round(distance, 4), "thickness_mm": round(wall, 4)}
+    # Rounded downwards: no tracer lies in the window.
+    true["window"] = {"distance_mm": round(distance - 1e-4, 4), "thickness_mm": round(wall, 4)}
 
 
 def _deepen(tree: Tree, by_mm: float) -> None:
@@ -290,11 +295,14 @@ def _scene(
     cell = 1.0 if array["layout"] == "square" else np.sqrt(0.75)
     lenses = FILLED**2 * np.prod(field) / lens_mm**2 / cell
     particles = max(1, round(density * float(lenses)))
+    rays, lens_px = float(np.clip(ALL_RAYS / particles, *RAYS)), 0.25 * np.pi * pitch_px**2
+    least = max(LEAST_COUNTS, LEAST_SHARE * full) * lens_px
+    light = min(share * full * lens_px, max(PHOTONS_OF_RAY * rays / photons, least))
     return {
         "particles": particles,
-        "rays": round(float(np.clip(ALL_RAYS / particles, *RAYS))),
+        "rays": round(rays),
         "particle_diameter_mm": true["reconstruction"]["particle_diameter_mm"],
-        "particle_counts": round(share * full * 0.25 * np.pi * pitch_px**2, 1),
+        "particle_counts": round(light, 1),
         "board_z_mm": round(float(rng.uniform(-0.4, 0.4)) * depth_mm / true["media"]["fluid"], 4),
         "board_tilt_deg": rng.uniform(-1.5, 1.5, 2).round(3).tolist(),
         "board_offset_mm": (rng.uniform(-1.0, 1.0, 2) * lens_mm).round(4).tolist(),

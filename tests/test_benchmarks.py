@@ -246,8 +246,8 @@ def test_verdicts_and_their_summary() -> None:
     for change in ({"recall": 0.4}, {"slope_u": 1.03}, {"coverage_x": 0.7}, {"tracks": 9.0}):
         assert outcome_of(fine | change, done).verdict == "silent"
         assert outcome_of(fine | change, Step("track", 0, "", ["lfpiv: few"], 1.0)).verdict == "warned"
-    hazy = Step("track", 0, "", ["lfpiv: 18 counts are taken off [haze]"], 1.0)
-    assert outcome_of(fine | {"recall": 0.4}, hazy).verdict == "silent"
+    for said in ("lfpiv: 18 counts are taken off [haze]", "lfpiv: few [few-tracers]", "lfpiv: none [no-board]"):
+        assert outcome_of(fine | {"recall": 0.4}, Step("track", 0, "", [said], 1.0)).verdict == "silent"
     off = {"magnification_off": -0.004, "magnification_sigma": 0.001}
     assert outcome_of(fine | off, done).faults == ["magnification -0.40 %"]
     assert outcome_of(fine | off | {"magnification_sigma": 0.002}, done).verdict == "worked"
@@ -258,10 +258,19 @@ def test_verdicts_and_their_summary() -> None:
     assert outcome_of({}, Step("build-weights", 3, "no room", [], 1.0)).verdict == "refused"
     assert outcome_of({}, Step("build-weights", 1, "ValueError", [], 1.0)).verdict == "failed"
     assert outcome_of(fine, done, Step("correlate", 4, "no", [], 1.0)).verdict == "failed"
+    # No track at all; an index that is off by as much as `check` says, and by more.
+    lost = Step("track", 0, "", ["lfpiv: none [no-tracks]"], 1.0)
+    assert outcome_of(fine | {"tracks": 0.0}, lost).verdict == "refused"
+    assert outcome_of(fine | {"tracks": 0.0, "slope_u": 1.03}, lost).verdict == "warned"
+    said = "no snapshot tells media.fluid of 1.33: 1% more makes depths and w 1% larger"
+    for slope, line, expected in ((1.05, said, "unknown"), (1.05, "", "silent"), (1.09, said, "silent")):
+        off = outcome_of(fine | {"slope_w": slope, "slope_w_sigma": 0.001}, done)
+        off.wrong_value, off.believed = "index", line
+        assert verdict(off) == expected
     # Summary names what is wrong without a word.
     silent = outcome_of({"bright": 1.0, "recall": 0.1, "tracers": 9.0}, Step("track", 0, "", [], 1.0))
     text = summary([silent, outcome_of({}, Step("build-weights", 3, "there is no room", [], 1.0))])
-    assert "2 rigs: 0 worked, 1 refused, 0 failed, 0 warned, 1 silent" in text
+    assert "2 rigs: 0 worked, 1 refused, 0 failed, 0 unknown, 0 warned, 1 silent" in text
     assert "silent: rig 1: recall 0.10" in text
     alarm = outcome_of(fine, Step("track", 0, "", ["lfpiv: odd [wrong-links]", "lfpiv: few [few-tracers]"], 1.0))
     assert "2 worked with nothing wrong: 1 warned" in summary([alarm, outcome_of(fine, done)])
@@ -269,10 +278,21 @@ def test_verdicts_and_their_summary() -> None:
 
 
 @pytest.mark.slow
-def test_a_tiny_rig_is_run_and_judged(tmp_path: Path) -> None:
+def test_a_tiny_rig_is_run_and_judged_and_not_run_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     drawn = (draw(SEED, number, (24, 20)) for number in range(40))
     rig = next(rig for rig in drawn if 3 <= rig.true["simulation"]["particles"] <= 60)
     outcome = run_rig(rig, tmp_path)
+    # A file of what was run before is all that is looked at.
+    monkeypatch.setattr(rigs, "run_rig", lambda *_: outcome)
+    arguments = ["--only", str(rig.number), "--out", str(tmp_path / "runs.jsonl")]
+    rigs.bench_rigs(arguments)
+    first = capsys.readouterr().out
+    monkeypatch.delattr(rigs, "run_rig")
+    rigs.bench_rigs(arguments)
+    assert first.endswith(capsys.readouterr().out)
+    assert "1 rigs: " in first
     assert outcome.verdict in ("worked", "refused", "failed", "warned", "silent")
     assert outcome.steps[0].command == "calibrate-snapshot"
     assert not [step for step in outcome.steps if step.exit_code == 1], row(outcome)
