@@ -94,7 +94,12 @@ def in_threads(work: Callable[[Item], Result], items: Iterable[Item]) -> list[Re
                 return
             done[place] = work(piece)
 
-    others = [_further(threads - 1).submit(take) for _ in range(threads - 1)]
+    # The calling thread's own pool.
+    owner, size, pool = getattr(_here, "pool", (0, 0, None))
+    if pool is None or (owner, size) != (get_native_id(), threads - 1):
+        pool = ThreadPoolExecutor(threads - 1)
+        _here.pool = (get_native_id(), threads - 1, pool)
+    others = [pool.submit(take) for _ in range(threads - 1)]
     try:
         take()
         # One that has not begun by now has nothing left to do.
@@ -104,15 +109,6 @@ def in_threads(work: Callable[[Item], Result], items: Iterable[Item]) -> list[Re
         left.clear()
         wait([other for other in others if not other.cancel()])
     return [done[place] for place in range(len(pieces))]
-
-
-def _further(threads: int) -> ThreadPoolExecutor:
-    """Return the calling thread's own pool of so many threads."""
-    owner, size, pool = getattr(_here, "pool", (0, 0, None))
-    if pool is None or (owner, size) != (get_native_id(), threads):
-        pool = ThreadPoolExecutor(threads)
-        _here.pool = (get_native_id(), threads, pool)
-    return pool
 
 
 def share_out(kernel: Callable[..., None], count: int, *arguments: object) -> None:

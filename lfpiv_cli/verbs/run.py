@@ -271,7 +271,7 @@ def watch(
     come = watched(options.images, "images", options, options.idle_s, console)
     atomic.ensure_writable(output / run_steps.RECORD, overwrite=True)
     watching = Watching(config, settings, output, options, overwrite, console)
-    watching.weights()
+    watching.chain([], console, recorded=True).weights()
     left_out: list[Failure] = []
     coming = (frames_of(files, keep_going=True) for files in come)
     try:
@@ -280,7 +280,12 @@ def watch(
         watching.take([], last=True)
     finally:
         console.say(f"{watching.count} pairs are done, in {output}; the same command goes on")
-    return watching.all_together(left_out)
+    if not watching.every:
+        raise InputError(f"{left_out[0].name}: {left_out[0].error}")
+    # Through all steps, which are found complete.
+    chain = watching.chain(watching.every, replace(console, only_warnings=True), recorded=True)
+    chain.failures = list(left_out)
+    return run_choice.take_all(chain)
 
 
 @dataclass
@@ -289,7 +294,7 @@ class Watching:
 
     Attributes
     ----------
-    count : pairs that are measured
+    count, every : how many pairs are measured, and all that have come
     """
 
     config: Path
@@ -301,7 +306,7 @@ class Watching:
     count: int = 0
     _prepared: Prepared = field(default_factory=Prepared)
     _choice: Choice | None = None
-    _every: Together = field(default_factory=list)
+    every: Together = field(default_factory=list)
     _waiting: Together = field(default_factory=list)
 
     def __post_init__(self) -> None:
@@ -310,7 +315,7 @@ class Watching:
         self._latest = Latest(self.output, self.console, self.options.report)
         self._weights = self.output / run_steps.WEIGHTS
 
-    def _chain(self, pairs: Together, console: Console, recorded: bool) -> Chain:
+    def chain(self, pairs: Together, console: Console, recorded: bool) -> Chain:
         """Return the steps of some pairs."""
         options, frames = self.options, [frame for pair in pairs for frame in pair]
         earlier = run_steps.earlier_run(self.output, self.overwrite) if recorded else {}
@@ -319,13 +324,9 @@ class Watching:
         two_by_two = Pairs(tuple((k, k + 1) for k in range(0, len(frames), 2)))
         return Chain(self.config, self.settings, given, frames, two_by_two, steps, self.overwrite, self._prepared)
 
-    def weights(self) -> None:
-        """Calibrate, and build the weights."""
-        self._chain([], self.console, recorded=True).weights()
-
     def take(self, pairs: Together, last: bool = False) -> None:
         """Measure pairs; the first ones when the tracers' size is known, or no others are to come."""
-        self._every += pairs
+        self.every += pairs
         self._waiting += pairs
         if not self._waiting or not self._is_ready(last) or self._choice is None:
             return
@@ -339,7 +340,7 @@ class Watching:
 
     def _is_ready(self, last: bool) -> bool:
         """Return whether all that pairs share is known, once the first have shown it."""
-        chain = self._chain(self._waiting, self._quiet, recorded=False)
+        chain = self.chain(self._waiting, self._quiet, recorded=False)
         if self._choice is None:
             try:
                 self._choice = run_choice.chosen(
@@ -368,7 +369,7 @@ class Watching:
     def _measure(self, pairs: Together, choice: Choice) -> int:
         """Take pairs through all steps, and tell of each; return how many were complete before."""
         begun, name = time.monotonic(), pairs[0][0].path.name
-        chain = self._chain(pairs, self._quiet, recorded=False)
+        chain = self.chain(pairs, self._quiet, recorded=False)
         try:
             fields = run_choice.measured(chain, choice, self._weights)
         except InputError as error:
@@ -389,14 +390,6 @@ class Watching:
             self._latest.measured(pairs[number][0].stem, tracers, files, path, seconds / len(pairs))
             self.count += 1
         return 0
-
-    def all_together(self, left_out: Sequence[Failure]) -> dict[str, Any]:
-        """Take all pairs through `run`, which finds them complete and tells of all."""
-        if not self._every:
-            raise InputError(f"{left_out[0].name}: {left_out[0].error}")
-        chain = self._chain(self._every, self._quiet, recorded=True)
-        chain.failures = list(left_out)
-        return run_choice.take_all(chain)
 
 
 @dataclass

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -162,11 +163,9 @@ def bench_of(settings: Config, half: str) -> BoardBench:
     if half == "ideal":
         paraxial = ObjectSpace(rig.media, None, "paraxial")
         weights = Weights(grid, (0, 0, 0), factorise_through(rig.camera, paraxial, grid), rig.camera.column_axis)
-
-        def ideal_picture(placement: BoardPlacement) -> Image:
-            return render_board(rig.camera, paraxial, rig.board, placement, level, rng).astype(np.float32)
-
-        return BoardBench(rig, weights, ideal_picture, np.zeros(weights.image_shape, np.bool_))
+        rendered = partial(render_board, rig.camera, paraxial, rig.board, level=level, rng=rng)
+        nothing = np.zeros(weights.image_shape, np.bool_)
+        return BoardBench(rig, weights, lambda placement: rendered(placement).astype(np.float32), nothing)
     space = ObjectSpace(rig.media, settings.window_model(), scene.refraction)
     assumed = settings.plane_space("validating boards")
     real = RecordingCamera(misalignment_of(settings).apply(rig.camera), readout_of(settings), scene.light.waves())
