@@ -34,7 +34,7 @@ from lfpiv_cli.validation.volume import pairs_of
 from lfpiv_cli.verbs.check import Pictures, image_lines, lattice_of
 from lfpiv_cli.verbs.checks import Line, worst
 from lfpiv_cli.verbs.particles import light_of
-from lfpiv_cli.verbs.planning import bench_of, diffraction_line, rig_figures, rig_lines, windows_line
+from lfpiv_cli.verbs.planning import believed_line, bench_of, diffraction_line, rig_figures, rig_lines, windows_line
 
 WATER = Media(1.0, 1.49, 1.33)
 Tree = dict[str, Any]
@@ -93,7 +93,7 @@ REFUSED = {
 def test_good_rigs_are_good(tree: Tree) -> None:
     lines = rig_lines(bench_of(settings_of(tree), None))
     # These are by rays.
-    found = [line for line in lines if line.verdict != "good"]
+    found = [line for line in lines if line.verdict not in ("good", "unknown")]
     assert [(line.about, line.verdict) for line in found] == [("diffraction", "look")], found
 
 
@@ -113,6 +113,17 @@ def test_what_rays_leave_out_is_said(keys: Tree, verdict: str, words: str) -> No
     line = diffraction_line(bench_of(settings_of(changed(PLAIN, **keys)), None))
     assert line.verdict == verdict
     assert words in line.reason
+
+
+@pytest.mark.parametrize(("index", "named"), [(1.33, True), (1.0, False)])
+def test_what_no_snapshot_tells_is_said_with_how_far_off_results_are(index: float, named: bool) -> None:
+    bench = replace(bench_of(settings_of(PLAIN), None), media=Media(1.0, 1.49, index))
+    line = believed_line(bench)
+    assert ("media.fluid of 1.33: 1% more makes depths and w 1% larger" in line.reason) == named
+    # At -1 a depth is n p N / M^2, N growing with 1 - M.
+    assert "magnification of -1: 1% more makes lengths 1.0% and depths 1.5% smaller" in line.reason
+    deeper = bench.camera.scale(replace(bench.media, fluid=1.01 * index)).depth_mm
+    assert deeper == pytest.approx(1.01 * bench.scale.depth_mm, rel=1e-12)
 
 
 @pytest.mark.thorough

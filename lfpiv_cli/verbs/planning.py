@@ -175,7 +175,7 @@ def rig_lines(bench: Bench) -> list[Line]:
         _voxels,
         windows_line,
         _time_step,
-        _believed,
+        believed_line,
         _cost,
     )
     return [question(bench) for question in questions]
@@ -431,7 +431,7 @@ def _time_step(bench: Bench) -> Line:
     return Line(about, "no" if beyond else "look", f"{reason}; {advice}")
 
 
-def _believed(bench: Bench) -> Line:
+def believed_line(bench: Bench) -> Line:
     """Say what one snapshot does not tell of a rig, and how far off depths and velocities are where it is off."""
     camera, index, known = bench.camera, bench.media.fluid, bench.found is not None and bench.found.pose is not None
     reasons = [] if known else ["no board tells camera.main_lens.magnification"]
@@ -441,9 +441,9 @@ def _believed(bench: Bench) -> Line:
         reasons[0] += f" of {camera.magnification:g}: 1% more makes lengths {across:.1%} and depths {along:.1%} smaller"
     if index != 1.0:
         reasons.append(f"no snapshot tells media.fluid of {index:g}: 1% more makes depths and w 1% larger")
-    if not reasons:
-        return Line("believed", "good", "the board tells the magnification, and depths need no index")
-    return Line("believed", "unknown", "; ".join([*reasons, "boards at several depths tell both"]))
+    reasons += ["boards at several depths tell"] if reasons else []
+    reasons.append("nothing tells which image of a pair is the first: exchanged, velocities change their sign")
+    return Line("believed", "unknown", "; ".join(reasons))
 
 
 def _cost_of(bench: Bench) -> Cost:
