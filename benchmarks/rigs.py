@@ -73,8 +73,11 @@ BRIGHT_SHARE = 0.5
 # What no image tells: what `check` says of it, and which figures it makes wrong by how much.
 BELIEVED = {"index": ("media.fluid of [0-9.]+: 1% more makes depths and w 1% larger", WRONG["index"][1])}
 
-# Advice on what a good rig measures or believes, which says nothing against its pictures.
+# Advice on what a good rig measures or believes, which says nothing against its pictures; it tells of no wrong result.
 ADVICE = {
+    "depth-ambiguous",
+    "paraxial-refraction",
+    "vectors-in-doubt",
     "few-tracers",
     "no-uncertainty",
     "windows-too-large",
@@ -373,17 +376,24 @@ def row(outcome: Outcome) -> str:
     return "\n".join(lines)
 
 
+def so_of(hard: Sequence[str]) -> set[str]:
+    """Return the codes of what is so under hard conditions: haze, and light from outside the volume."""
+    return ({"haze"} if "haze" in hard else set()) | ({"light-unexplained"} if "outside" in hard else set())
+
+
 def summary(outcomes: Sequence[Outcome]) -> str:
     """Return how many rigs came to what, and which ones were wrong without a word."""
     count = Counter(outcome.verdict for outcome in outcomes)
     verdicts = ", ".join(
         f"{count[name]} {name}" for name in ("worked", "refused", "failed", "unknown", "warned", "silent")
     )
-    right = [each for each in outcomes if each.verdict == "worked" and not each.wrong_value and not each.hard]
-    alarms = [each for each in right if set(codes(each.steps)) - ADVICE]
+    right = [each for each in outcomes if each.verdict == "worked" and not each.wrong_value]
+    said = [(each.number, set(codes(each.steps)) - ADVICE - so_of(each.hard)) for each in right]
+    alarms = [(number, of_it) for number, of_it in said if of_it]
     lines = [f"{len(outcomes)} rigs: {verdicts}", f"{len(right)} worked with nothing wrong: {len(alarms)} warned"]
     for name in ("refused", "failed"):
         lines.extend(f"{name}: rig {each.number}: {each.error}" for each in outcomes if each.verdict == name)
+    lines.extend(f"warned although right: rig {number}: {', '.join(sorted(of_it))}" for number, of_it in alarms)
     for each in outcomes:
         if each.verdict == "silent":
             doubt = f" (wrong {each.wrong_value})" if each.wrong_value else ""

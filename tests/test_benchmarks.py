@@ -273,7 +273,10 @@ def test_verdicts_and_their_summary() -> None:
     assert "2 rigs: 0 worked, 1 refused, 0 failed, 0 unknown, 0 warned, 1 silent" in text
     assert "silent: rig 1: recall 0.10" in text
     alarm = outcome_of(fine, Step("track", 0, "", ["lfpiv: odd [wrong-links]", "lfpiv: few [few-tracers]"], 1.0))
-    assert "2 worked with nothing wrong: 1 warned" in summary([alarm, outcome_of(fine, done)])
+    hazy = outcome_of(fine, Step("reconstruct particles", 0, "", ["lfpiv: veil [haze]"], 1.0))
+    assert "3 worked with nothing wrong: 2 warned" in summary([alarm, outcome_of(fine, done), replace(hazy, number=2)])
+    assert "2 worked with nothing wrong: 1 warned" in summary([alarm, replace(hazy, number=2, hard=("haze",))])
+    assert "warned although right: rig 1: wrong-links" in summary([alarm])
     assert "there is no room" in text
 
 
