@@ -76,7 +76,6 @@ BELIEVED = {"index": ("media.fluid of [0-9.]+: 1% more makes depths and w 1% lar
 # Advice on what a good rig measures or believes, which says nothing against its pictures; it tells of no wrong result.
 ADVICE = {
     "depth-ambiguous",
-    "paraxial-refraction",
     "vectors-in-doubt",
     "few-tracers",
     "no-uncertainty",
@@ -377,8 +376,9 @@ def row(outcome: Outcome) -> str:
 
 
 def so_of(hard: Sequence[str]) -> set[str]:
-    """Return the codes of what is so under hard conditions: haze, and light from outside the volume."""
-    return ({"haze"} if "haze" in hard else set()) | ({"light-unexplained"} if "outside" in hard else set())
+    """Return the codes of what is so: refraction by the rig; under hard conditions haze, light from outside."""
+    of_hard = {"haze": "haze", "outside": "light-unexplained"}
+    return {"paraxial-refraction"} | {of_hard[each] for each in hard if each in of_hard}
 
 
 def summary(outcomes: Sequence[Outcome]) -> str:

@@ -304,6 +304,7 @@ def test_columns_on_demand_cost_more_than_factors(tmp_path: Path) -> None:
     [
         (100, 4.9, {}, []),
         (100, 5.1, {}, ["wrong-links"]),
+        (4, 0.4, {}, []),
         (0, 0.0, {}, []),
         # a track of five places has four links
         (20, 3.9, {"tracked": 100, "noise_over_stated": [1.3, 2.9, 1.0]}, []),

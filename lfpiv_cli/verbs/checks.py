@@ -43,8 +43,8 @@ ONE_SIDED = 0.5
 FEW = FEWEST_OF_FIT + 2
 # Of good pairs four in five particles or more are linked; of unrelated images chance links three in ten.
 LEAST_LINKED = 0.5
-# The share of probably wrong links above which vectors of single tracks are in doubt.
-MOST_WRONG = 0.05
+# The share of probably wrong links above which vectors of single tracks are in doubt, of half a link at least.
+MOST_WRONG, LEAST_WRONG_LINKS = 0.05, 0.5
 # Pulses of one laser differ by less; where they do not, the fainter image has markedly larger errors.
 MOST_UNEQUAL = 1.25
 # Particles' places scatter by one to two stated errors about smooth paths; what is more is the flow's.
@@ -277,7 +277,7 @@ def doubt_notices(summary: Mapping[str, Any], name: str) -> list[Notice]:
     if "tracked" in summary:
         links = summary["tracked"] - summary["tracks"]
     wrong = summary["expected_wrong_links"] / links if links else 0.0
-    if wrong > MOST_WRONG:
+    if wrong > MOST_WRONG and summary["expected_wrong_links"] >= LEAST_WRONG_LINKS:
         text = f"{wrong:.0%} of the links are probably wrong, by their alternatives"
         remedy = "a shorter time between the images, fewer tracers, or larger windows and correlate"
         notices.append(Notice("wrong-links", name, text, remedy, wrong, f"at most {MOST_WRONG:g}"))
