@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from lfpiv_cli.calibration.board import another_kind, dot_signal, locate_board, sentence
 from lfpiv_cli.calibration.board_pose import BoardGeometry, BoardPose, off_focus_mm, pose_of_dots, upright_numbers
-from lfpiv_cli.calibration.corners import corner_shape, quadrant_shares
-from lfpiv_cli.calibration.shape_fit import lens_cell, pixel_rays, scene_shares
+from lfpiv_cli.calibration.corners import quadrant_shares
+from lfpiv_cli.calibration.shape_fit import lens_cell
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.names import Polarity
 from lfpiv_cli.optics.camera import Camera, Lattice
@@ -232,24 +232,6 @@ def test_auto_sees_whether_dots_are_bright_or_dark(rng: np.random.Generator) -> 
         image = (np.where(on_dots, dot, ground) * passed + rng.normal(0.0, 5.0, passed.shape)).astype(np.float32)
         found = dot_signal(image, passed, replace(DOTS, polarity="auto"))
         np.testing.assert_array_equal(found, dot_signal(image, passed, replace(DOTS, polarity=polarity)))
-
-
-@pytest.mark.parametrize("z_mm", [0.4, -6.0])
-def test_slopes_of_the_corners_shares_are_their_differences(camera: Camera, water: Media, z_mm: float) -> None:
-    # The sensor stands off the microlenses' focus, so that all of the cell's scale counts.
-    camera = replace(small(camera), microlens_distance_mm=1.03 * camera.microlens_distance_mm)
-    row, column = (axis.ravel() for axis in np.mgrid[200:250:3, 280:330:3])
-    rays, place = pixel_rays(camera, column, row), np.array([0.013, -0.021, z_mm])
-    shape = corner_shape(np.array([[0.79, 0.03], [-0.05, 0.8]]))
-    _, slopes = scene_shares(rays, camera, water, shape, place)
-    for axis in range(3):
-        step = np.zeros(3)
-        step[axis] = 1e-5
-        ahead, behind = (scene_shares(rays, camera, water, shape, place + sign * step)[0] for sign in (1, -1))
-        off = np.abs((ahead - behind) / 2e-5 - slopes[:, axis])
-        assert np.abs(slopes[:, axis]).max() > 0.02
-        # an edge that passes through a cell's corner within the step makes a kink; there are few
-        assert np.percentile(off, 98) < 1e-4 * np.abs(slopes[:, axis]).max()
 
 
 @pytest.mark.thorough
