@@ -13,9 +13,16 @@ from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media
 from lfpiv_cli.particles.fitting import add_all
 from lfpiv_cli.particles.search import Task, task_of
-from lfpiv_cli.particles.view import raw_view
+from lfpiv_cli.particles.view import View, raw_view
 from lfpiv_cli.reconstruction.solvers import normalisers
 from lfpiv_cli.weights.model import Weights
+
+
+def light_on(view: View, particles: Floats, depths_mm: tuple[float, float]) -> Floats:
+    """Return the light (pixels,) of particles (n, 4), of which those between two depths are seen, without noise."""
+    image = np.zeros(view.camera.rows * view.camera.columns)
+    add_all(view, particles, 1.0, image, depths_mm)
+    return image
 
 
 def task_with(table2: Camera, water: Media, true: Floats, rng: np.random.Generator, noise: float = 6.0) -> Task:
@@ -24,8 +31,7 @@ def task_with(table2: Camera, water: Media, true: Floats, rng: np.random.Generat
     grid = Grid.centred((20, 16, 20), (0.1, 0.1, 0.1), (0.0, 0.0, 1.9))
     weights = Weights.factorised(camera, water, grid)
     view, depths = raw_view(camera, water, 0.025), grid.bounds_mm(2)
-    image = np.zeros(camera.rows * camera.columns)
-    add_all(view, true, 1.0, image, depths)
+    image = light_on(view, true, depths)
     image += rng.normal(0.0, noise, image.size)
     shaped = image.reshape(camera.rows, camera.columns).astype(np.float32)
     return task_of(shaped, view, weights, camera, normalisers(weights.padded), None)

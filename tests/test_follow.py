@@ -18,10 +18,10 @@ from lfpiv_cli.files.batch import Frame
 from lfpiv_cli.files.images import write_tiff
 from lfpiv_cli.files.particle_file import TRAJECTORIES_FORMAT, Points, read_points
 from lfpiv_cli.files.shares import Deadline
-from lfpiv_cli.particles.fitting import add_all
 from lfpiv_cli.particles.view import raw_view
 from lfpiv_cli.verbs import follow as stage
 from tests.commands import run, sample_weights
+from tests.particle_images import light_on
 
 FRAMES, COUNT = 4, 12
 # 0.8, -0.4 and 0.5 voxels a frame.
@@ -47,9 +47,8 @@ def rig(tmp_path_factory: pytest.TempPathFactory) -> Path:
     rng = np.random.default_rng(2)
     light = rng.uniform(4e5, 6e5, COUNT)
     for number, places in enumerate(true_places()):
-        image = np.zeros(content.camera.rows * content.camera.columns)
         particles = np.column_stack([content.camera.to_image_axes(places), light])
-        add_all(view, particles, 1.0, image, content.weights.grid.bounds_mm(2))
+        image = light_on(view, particles, content.weights.grid.bounds_mm(2))
         counts = np.rint(DARK_COUNTS + image + rng.normal(0.0, 6.0, image.size)).clip(0, 65535)
         write_tiff(
             folder / f"frame_{number}.tif", counts.astype(np.uint16).reshape(content.image_shape), overwrite=True

@@ -13,12 +13,12 @@ from lfpiv_cli.files.images import read_image, write_tiff
 from lfpiv_cli.files.vtkhdf import open_volume
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media
-from lfpiv_cli.particles.fitting import add_all
 from lfpiv_cli.particles.noise import Noise
 from lfpiv_cli.particles.view import raw_view
 from lfpiv_cli.reconstruction.haze import Haze, White
 from lfpiv_cli.synthetic.render import Readout, render_white
 from tests.commands import AT_FOCUS, SAMPLE, run, sample_rig, told
+from tests.particle_images import light_on
 
 DEPTHS_MM, LIGHT_COUNTS = (-1.5, 2.5), 5e5
 # Read noise twice: of a frame and of its dark image.
@@ -42,9 +42,8 @@ def tracers(camera: Camera, media: Media, per_lens: float, rng: np.random.Genera
     half = 0.6 * camera.pixel_mm * np.array([camera.columns, camera.rows])
     number = round(per_lens * 4.0 * float(np.prod(half)) / camera.lattice.cell_area)
     places = rng.uniform((*-half, DEPTHS_MM[0]), (*half, DEPTHS_MM[1]), (number, 3))
-    image = np.zeros(camera.rows * camera.columns)
     balls = np.column_stack([places, LIGHT_COUNTS * rng.uniform(0.6, 1.4, number)])
-    add_all(raw_view(camera, media, 0.025), balls, 1.0, image, DEPTHS_MM)
+    image = light_on(raw_view(camera, media, 0.025), balls, DEPTHS_MM)
     return image.reshape(camera.rows, camera.columns)
 
 

@@ -23,12 +23,12 @@ from lfpiv_cli.names import Layout
 from lfpiv_cli.optics.camera import Camera, Lattice
 from lfpiv_cli.optics.media import Media
 from lfpiv_cli.optics.tracing import ObjectSpace
-from lfpiv_cli.particles.fitting import add_all
 from lfpiv_cli.particles.view import raw_view
 from lfpiv_cli.synthetic.render import Balls, render_points
 from lfpiv_cli.weights.build import factorise
 from lfpiv_cli.weights.operators import adjoint_reference, forward_reference
 from lfpiv_cli.weights.quadrature import RayCount, count_rays, integrate_columns, sampling_error
+from tests.particle_images import light_on
 
 # Off the axis and out of focus: a point's light goes through several lenses.
 PLACE_MM, POINT_MM = (0.02, -0.01, 1.8), (1e-3, 1e-3, 1e-3)
@@ -99,8 +99,7 @@ def test_columns_are_what_rays_make(water: Media, coarse: Camera, rng: np.random
 @pytest.mark.thorough
 def test_particles_are_balls_as_rays_make_them(water: Media, coarse: Camera, rng: np.random.Generator) -> None:
     view, particles = raw_view(coarse, water, 0.025), np.array([(*PLACE_MM, 1.0)])
-    image = np.zeros(400)
-    add_all(view, particles, 1.0, image, (1.0, 2.0))
+    image = light_on(view, particles, (1.0, 2.0))
     space = ObjectSpace(water, None, "paraxial")
     rendered = render_points(coarse, space, Balls(PLACE_MM, 1.0, 0.05), rng, rays=4000).ravel()
     # 4,000 rays over some 50 pixels

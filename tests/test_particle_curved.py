@@ -18,6 +18,7 @@ from lfpiv_cli.particles.pencil import MEAN_SQUARE, NODES, WEIGHTS, cubic_at, pe
 from lfpiv_cli.particles.refraction import on_line_of_sight, places_by_snell
 from lfpiv_cli.particles.view import View, entry_capacity, footprint_radius_mm, on_array_mm, raw_view, tile_side_mm
 from tests.known_rays import image_of
+from tests.particle_images import light_on
 from tests.particle_twin import respond_once
 
 RADIUS_MM = 0.025
@@ -203,8 +204,7 @@ def test_fits_return_to_the_truth_and_scatter_as_stated(camera: Camera, water: M
     view = raw_view(replace(camera, columns=260), water, RADIUS_MM, space=pipe(water))
     for place in ((0.1, 0.2, 2.5), (-0.1, 3.0, 1.5), (0.1, 4.3, 1.2)):
         true = np.array([[*place, 4e4]])
-        model = np.zeros(view.camera.rows * view.camera.columns)
-        add_all(view, true, 1.0, model, DEPTHS)
+        model = light_on(view, true, DEPTHS)
         sigma = np.sqrt(model + 36.0)
         values = images(view, np.array(place))
         slopes = np.column_stack([4e4 * values[:, 1:], values[:, 0]])

@@ -11,12 +11,13 @@ from scipy.signal import lfilter
 from lfpiv_cli.optics.camera import Camera, Lattice
 from lfpiv_cli.optics.media import Media
 from lfpiv_cli.particles.covariance import joint_covariance
-from lfpiv_cli.particles.fitting import Least, accept, add_all, claimed_share, judge, refine
+from lfpiv_cli.particles.fitting import Least, accept, claimed_share, judge, refine
 from lfpiv_cli.particles.least_squares import Observation, normal_equations, observation_of
 from lfpiv_cli.particles.noise import WHITE, Correlation, Noise, error_correlation, measured_noise
 from lfpiv_cli.particles.suspects import split, try_other_depths
 from lfpiv_cli.particles.view import Light, View, entry_capacity, groups_of_tiles, raw_view, with_radius
 from lfpiv_cli.self_calibration.nuisances import Nuisances, fit_nuisances
+from tests.particle_images import light_on
 from tests.particle_twin import respond_once
 
 DEPTHS = (-4.0, 4.0)
@@ -29,9 +30,7 @@ def view(table2: Camera, water: Media) -> View:
 
 
 def image_of(view: View, particles: NDArray[np.float64]) -> NDArray[np.float64]:
-    image = np.zeros(view.camera.rows * view.camera.columns)
-    add_all(view, particles, 1.0, image, DEPTHS)
-    return image
+    return light_on(view, particles, DEPTHS)
 
 
 def observed(view: View, residual: NDArray[np.float64], weight: NDArray[np.float64]) -> Observation:

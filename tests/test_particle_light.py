@@ -24,7 +24,7 @@ from lfpiv_cli.verbs.frames import Bench, bench_of, frame_notices
 from lfpiv_cli.verbs.particles import find, frame_of, points_of, task_for, tracers_per_lens
 from lfpiv_cli.verbs.tracers import TracerSize, light_notices
 from tests.commands import AT_FOCUS, sample_rig
-from tests.particle_images import task_with
+from tests.particle_images import light_on, task_with
 
 
 @pytest.fixture
@@ -91,9 +91,8 @@ def with_others(view: View, place: tuple[float, ...], light: float, noise: Float
 
     `noise` (pixels,) is of the image in standard errors.
     """
-    particle, image = np.array([[*place, light]]), np.zeros(view.camera.rows * view.camera.columns)
-    add_all(view, particle, 1.0, image, DEPTHS)
-    variance = READ_COUNTS**2 + 2.0 * image
+    particle = np.array([[*place, light]])
+    variance = READ_COUNTS**2 + 2.0 * light_on(view, particle, DEPTHS)
     residual = noise * np.sqrt(variance)
     observation = observation_of(view, residual.copy(), 1.0 / variance, DEPTHS)
     covariance = np.diag(np.square([*SURE_MM, 0.01 * light]))[np.newaxis]
@@ -168,9 +167,7 @@ def small_camera(table2: Camera) -> Camera:
 
 
 def image_of_all(view: View, particles: np.ndarray) -> np.ndarray:
-    image = np.zeros(view.camera.rows * view.camera.columns)
-    add_all(view, particles, 1.0, image, DEPTHS)
-    return image
+    return light_on(view, particles, DEPTHS)
 
 
 def told(small_camera: Camera, water: Media, times: float, count: int, rng: np.random.Generator) -> FocalLength | None:
@@ -226,9 +223,7 @@ def test_tracers_are_fitted_behind_the_vignetting_of_the_white_image(bench: Benc
     image, content = image_of(bench, 0.1, 0), replace(bench.content, vignetting=vignetting)
     frame = frame_of(bench, image, image)
     view, plain = (task_for(replace(bench, content=each), frame).view for each in (content, bench.content))
-    particles, lit = np.array([[0.6, -0.5, 1.8, 1e5]]), np.zeros((2, image.size))
-    for each, light in zip((view, plain), lit, strict=True):
-        add_all(each, particles, 1.0, light, (1.4, 2.4))
+    lit = [light_on(each, np.array([[0.6, -0.5, 1.8, 1e5]]), (1.4, 2.4)) for each in (view, plain)]
     surface = vignetting_surface(vignetting, content.image_shape).ravel()
     np.testing.assert_allclose(lit[0], surface * lit[1], atol=1e-6 * lit[1].max())
     assert surface[lit[1] > 0.0].max() < 0.95

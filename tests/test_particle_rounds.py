@@ -14,7 +14,6 @@ from lfpiv_cli.optics.camera import Camera, Lattice
 from lfpiv_cli.optics.media import Media
 from lfpiv_cli.optics.tracing import ObjectSpace
 from lfpiv_cli.optics.waves import Waves
-from lfpiv_cli.particles.fitting import add_all
 from lfpiv_cli.particles.joining import boxes_of, explain_rest, find_peaks
 from lfpiv_cli.particles.rounds import ROUNDS, find_particles, first_pass, first_typical_light
 from lfpiv_cli.particles.search import noise_with, task_of
@@ -25,7 +24,7 @@ from lfpiv_cli.validation.volume import particle_figures
 from lfpiv_cli.verbs.tracers import MUCH_LEFT_ALIKE
 from lfpiv_cli.weights.build import default_padding, factorise, factorise_bricks
 from lfpiv_cli.weights.model import Weights
-from tests.particle_images import task_with
+from tests.particle_images import light_on, task_with
 
 
 def weights_of(camera: Camera, media: Media, grid: Grid) -> Weights:
@@ -89,8 +88,7 @@ def test_the_same_image_in_a_larger_world_shows_the_same(
     camera = replace(table2, columns=200, rows=180)
     # Some overlap, some lie near the focal plane: candidates, splitting, other depths and merging all take part.
     true = rng.uniform((-0.4, -0.35, -0.6, 3e5), (0.4, 0.35, 1.3, 6e5), (12, 4))
-    image = np.zeros(camera.rows * camera.columns)
-    add_all(raw_view(camera, water, 0.025), true, 1.0, image, (-1.0, 2.0))
+    image = light_on(raw_view(camera, water, 0.025), true, (-1.0, 2.0))
     image = (image + rng.normal(0.0, 6.0, image.size)).reshape(camera.rows, camera.columns).astype(np.float32)
     found = []
     # Powers of two leave every digit as it is: a length that does not scale is all that can make a difference.
@@ -116,8 +114,7 @@ def test_a_single_tracer_is_found_in_a_volume_that_is_partly_out_of_view(
     camera = replace(table2, columns=160, rows=160)
     weights = weights_of(camera, water, Grid.centred((24, 24, 7), (0.1, 0.1, 0.1), (0.0, 0.0, 1.9)))
     true, view = np.array([[0.05, -0.1, 1.8, 5e5]]), raw_view(camera, water, 0.025)
-    image = np.zeros(camera.rows * camera.columns)
-    add_all(view, true, 1.0, image, (1.0, 3.0))
+    image = light_on(view, true, (1.0, 3.0))
     image = np.rint(with_noise(image, rng)).reshape(camera.rows, camera.columns).astype(np.float32)
     state = first_pass(task_of(image, view, weights, camera, normalisers(weights.padded)), ROUNDS[:1])
     np.testing.assert_allclose(state.particles, true, rtol=0.02, atol=2e-3)
@@ -150,8 +147,7 @@ def test_any_brightness_will_do(
     view, axis = raw_view(camera, water, 0.025), np.array([-0.42, 0.0, 0.42])
     true = np.stack(np.meshgrid(axis, axis, [1.9], [counts], indexing="ij"), axis=-1).reshape(-1, 4)
     true[:, :3] += rng.uniform((-0.05, -0.05, -0.3), (0.05, 0.05, 0.3), (9, 3))
-    image = np.zeros(camera.rows * camera.columns)
-    add_all(view, true, 1.0, image, (1.0, 3.0))
+    image = light_on(view, true, (1.0, 3.0))
     if recorded != "without noise":
         image = with_noise(image, rng)
     if recorded == "thresholded":
@@ -274,8 +270,7 @@ def test_tracers_beyond_the_volume_are_found_there_and_hurt_no_other(table2: Cam
     grid = Grid.centred((18, 15, 9), (0.1, 0.1, 0.1), (0.0, 0.0, 1.9))
     weights, view = weights_of(camera, water, grid), raw_view(camera, water, 0.025)
     true = rng.uniform((-0.8, -0.7, 0.5, 3e5), (0.8, 0.7, 3.3, 6e5), (60, 4))
-    image = np.zeros(camera.rows * camera.columns)
-    add_all(view, true, 1.0, image, (0.0, 4.0))
+    image = light_on(view, true, (0.0, 4.0))
     image = np.rint(with_noise(image, rng)).reshape(camera.rows, camera.columns).astype(np.float32)
     found = find_particles(task_of(image, view, weights, camera, normalisers(weights.padded)))
     sigma = np.sqrt(np.diagonal(found.covariance_mm2, axis1=1, axis2=2))

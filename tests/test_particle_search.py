@@ -11,11 +11,11 @@ from lfpiv_cli.arrays import Flags, Floats
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media
 from lfpiv_cli.particles import search
-from lfpiv_cli.particles.fitting import add_all, refine
+from lfpiv_cli.particles.fitting import refine
 from lfpiv_cli.particles.joining import with_twins_joined
 from lfpiv_cli.particles.least_squares import SMALLEST_GAIN, Observation
 from lfpiv_cli.particles.search import State, Task, blank, disturbance, merge, noise_with, observed, rebuilt
-from tests.particle_images import found, task_with
+from tests.particle_images import found, light_on, task_with
 
 SWEEPS = 6
 
@@ -57,9 +57,7 @@ def test_sweeps_end_where_those_over_all_end(task: Task, true: Floats, monkeypat
 
 
 def light_of(task: Task, particles: Floats) -> Floats:
-    image = np.zeros_like(task.image)
-    add_all(task.view, particles, 1.0, image, task.depths_mm)
-    return image
+    return light_on(task.view, particles, task.depths_mm)
 
 
 @pytest.mark.thorough

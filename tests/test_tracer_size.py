@@ -16,13 +16,13 @@ from lfpiv_cli.optics.line_responses import USUAL_DIFFUSION_PX
 from lfpiv_cli.optics.media import Media
 from lfpiv_cli.particles.diameter import NO_SIZES, Diameter, Sizes, Trial, _settled_sizes, diameter_by, diameter_of
 from lfpiv_cli.particles.diffusion import MODEL_SHARE, MODEL_SQUARES, Forms, forms_of, together_of
-from lfpiv_cli.particles.fitting import add_all
 from lfpiv_cli.particles.search import Task, task_of
 from lfpiv_cli.particles.view import Light, entry_capacity, raw_view, with_radius
 from lfpiv_cli.reconstruction.solvers import normalisers
 from lfpiv_cli.verbs.tracers import Diffusion, TracerSize, size_notices
 from lfpiv_cli.weights.model import Weights
 from tests.commands import ROOT
+from tests.particle_images import light_on
 from tests.particle_twin import respond_once
 
 LENS_MM = 0.1
@@ -36,8 +36,7 @@ def rng() -> np.random.Generator:
 
 def image_of(camera: Camera, media: Media, tracers: Floats, lenses: float, waves: Light | None = None) -> Floats:
     """Return what tracers (n, 4) of a diameter in microlenses show, without noise."""
-    image = np.zeros(camera.rows * camera.columns)
-    add_all(raw_view(camera, media, 0.5 * lenses * LENS_MM, light=waves), tracers, 1.0, image, DEPTHS_MM)
+    image = light_on(raw_view(camera, media, 0.5 * lenses * LENS_MM, light=waves), tracers, DEPTHS_MM)
     return image.reshape(camera.rows, camera.columns)
 
 

@@ -21,6 +21,7 @@ from lfpiv_cli.self_calibration.refinement import Refinement
 from lfpiv_cli.self_calibration.scene_refinement import SceneRefinement, together, wall_by_places
 from lfpiv_cli.self_calibration.walls import Walls, find_round_wall, find_walls
 from lfpiv_cli.verbs.refine import scene_notices
+from tests.particle_images import light_on
 
 WIDTH, MIDDLE, SLOPE = 8.0, -0.37, np.array([0.02, -0.013])
 SEARCHED = (-6.0, 6.0)
@@ -337,8 +338,7 @@ def test_images_tell_where_a_pipe_lies(config: Config) -> None:
     view = raw_view(camera, space.media, 0.025, None, space)
     truth = Nuisances.of(np.concatenate([np.zeros(5), 0.3 * TRUTH]))
     places = np.column_stack([rng.uniform((-1.5, -0.7, -4.5), (1.5, 0.7, 4.5), (60, 3)), rng.uniform(4e5, 6e5, 60)])
-    noise, image = Noise(2.0, 0.2), np.zeros(camera.rows * camera.columns)
-    add_all(truth.applied(view, scene), places, 1.0, image, depths)
+    noise, image = Noise(2.0, 0.2), light_on(truth.applied(view, scene), places, depths)
     # Of tracers cut by the wall on one side there is a smaller part, and no place of a whole one looks like it.
     across = rng.uniform(0.5, 1.4, 16)
     own = np.column_stack([rng.uniform(-0.7, 0.7, 16), across, np.sqrt(4.982**2 - across**2)])
