@@ -1,4 +1,4 @@
-"""Rays followed in other ways than the package does, to compare with."""
+"""Rays followed in other ways than the package does, to compare with, and the tube that they go through."""
 
 from __future__ import annotations
 
@@ -8,11 +8,19 @@ from numpy.typing import ArrayLike
 
 from lfpiv_cli.arrays import Flags, Floats
 from lfpiv_cli.optics.camera import Camera
-from lfpiv_cli.optics.curved_space import ROUNDING_MM, CurvedSpace, in_fluid, refracted, trace_in
+from lfpiv_cli.optics.curved_space import ROUNDING_MM, CurvedSpace, Face, in_fluid, refracted, trace_in
 from lfpiv_cli.optics.media import Media, Window, equivalent_object_distance, fluid_path_to_focus
 from lfpiv_cli.optics.shapes import Vector, dot, plus, scaled
-from lfpiv_cli.optics.surfaces import Faces, meet
+from lfpiv_cli.optics.surfaces import Cylinder, Faces, meet
 from lfpiv_cli.optics.tracing import disc_points, exact_slope, trace
+
+
+def tube_of(
+    media: Media, axis: Vector = (1.0, 0.0, 0.0), centre_mm: Vector = (0.0, 0.0, 0.0), outer_mm: float = 7.0
+) -> CurvedSpace:
+    """Return a tube of 10 mm inside, by default with a wall of 2 mm, full of the fluid."""
+    walls = ((outer_mm, media.window), (5.0, media.fluid))
+    return CurvedSpace(media, tuple(Face(Cylinder(centre_mm, axis, radius), index) for radius, index in walls))
 
 
 def slopes_equivalent(points: Floats, lens: Floats, camera: Camera, media: Media) -> Floats:

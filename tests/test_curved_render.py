@@ -13,19 +13,15 @@ from lfpiv_cli.arrays import Floats
 from lfpiv_cli.optics.camera import Camera, Lattice
 from lfpiv_cli.optics.curved_space import CurvedSpace, Face
 from lfpiv_cli.optics.media import Media, Window, fluid_path_to_focus
-from lfpiv_cli.optics.surfaces import Cylinder, Plane
+from lfpiv_cli.optics.surfaces import Plane
 from lfpiv_cli.optics.tracing import ObjectSpace, disc_points, trace
 from lfpiv_cli.synthetic import rays as of_rays
 from lfpiv_cli.synthetic.rays import FITTED, SEQUENCE, TERMS, TOLERANCE_MM, fit_of_slopes, fitted_slopes, unseen
 from lfpiv_cli.synthetic.render import Balls, render_points
+from tests.known_rays import tube_of
 
 WATER = Media(1.0, 1.49, 1.33)
 OUTER_MM, INNER_MM, APERTURE_MM = 7.0, 5.0, 12.5
-
-
-def tube(outer: float = OUTER_MM) -> CurvedSpace:
-    walls = ((outer, 1.49), (INNER_MM, 1.33))
-    return CurvedSpace(WATER, tuple(Face(Cylinder((0.0,) * 3, (1.0, 0.0, 0.0), r), index) for r, index in walls))
 
 
 @pytest.fixture
@@ -56,7 +52,7 @@ def test_images_behind_a_tube_are_those_of_rays_aimed_one_by_one(small: Camera) 
     """With balls in the middle, and so near the rim that the polynomial does not do."""
     wide, rays = replace(small, columns=400, rows=2800), 3000
     points, diameters = np.array([[0.1, 0.3, 2.0], [0.0, 4.97, 0.1], [-0.2, -3.0, -3.5]]), np.array([0.1, 0.05, 0.05])
-    found = render_points(wide, tube(), Balls(points, 1.0, diameters), np.random.default_rng(5), rays=rays)
+    found = render_points(wide, tube_of(WATER), Balls(points, 1.0, diameters), np.random.default_rng(5), rays=rays)
     expected = np.zeros_like(found)
     for point, diameter, shift in zip(points, diameters, np.random.default_rng(5).random((3, 4)), strict=True):
         a, b, c, d = ((shift + np.arange(rays)[:, np.newaxis] * SEQUENCE) % 1.0).T
@@ -65,7 +61,7 @@ def test_images_behind_a_tube_are_those_of_rays_aimed_one_by_one(small: Camera) 
         )
         r = 0.5 * diameter * np.sqrt(1 - c ** (2 / 3))
         starts = point + np.stack([r * np.cos(2 * np.pi * d), r * np.sin(2 * np.pi * d), 0 * r], axis=1)
-        slopes, leaves = tube().slopes(wide, wide.to_image_axes(starts), lens)
+        slopes, leaves = tube_of(WATER).slopes(wide, wide.to_image_axes(starts), lens)
         assert leaves.all()
         column, row = np.rint(wide.mm_to_px(trace(wide, lens, slopes).sensor_mm)).astype(int).T
         inside = (column >= 0) & (column < wide.columns) & (row >= 0) & (row < wide.rows)
@@ -76,7 +72,7 @@ def test_images_behind_a_tube_are_those_of_rays_aimed_one_by_one(small: Camera) 
 
 def test_fitted_slopes_are_right_where_they_say_so(camera: Camera, rng: np.random.Generator) -> None:
     """Within a nanometre on the array, of rays that the fit has not seen; near the rim they say that they are not."""
-    faces, seen, radius = tube().for_kernels(camera), camera.for_kernels(), 0.025
+    faces, seen, radius = tube_of(WATER).for_kernels(camera), camera.for_kernels(), 0.025
     points = np.concatenate([rng.uniform(-6.5, 6.5, (60, 1)), disc_points(60, 4.97, rng)], axis=1)
     points = np.concatenate([points, [[0.0, 4.97, 0.0], [1.0, -4.96, 0.2]]])
     fits = []
@@ -88,7 +84,7 @@ def test_fitted_slopes_are_right_where_they_say_so(camera: Camera, rng: np.rando
         for k in range(300):
             of_rays.write_terms(*lens[k], *ball[k], terms[k])
         starts = point + radius * np.column_stack([ball, np.zeros(300)])
-        slopes, leaves = tube().slopes(camera, starts, APERTURE_MM * lens)
+        slopes, leaves = tube_of(WATER).slopes(camera, starts, APERTURE_MM * lens)
         if is_right:
             assert leaves.all()
             assert np.abs(terms @ coefficients - slopes).max() * camera.image_distance_mm < 2.0 * TOLERANCE_MM
@@ -101,14 +97,14 @@ def test_points_outside_the_fluid_are_dark_and_told_on_any_number_of_threads(
     small: Camera, rng: np.random.Generator, one_thread: Callable[[], AbstractContextManager[None]]
 ) -> None:
     points = np.array([[0.0, 0.0, 0.0], [0.0, 5.5, 0.0], [0.1, 0.0, -6.0], [0.0, 0.0, -9.0]])
-    np.testing.assert_array_equal(unseen(small, tube(), points), [False, True, True, True])
-    image = render_points(small, tube(), Balls(points[1:], 1.0, 0.05), rng, rays=100)
+    np.testing.assert_array_equal(unseen(small, tube_of(WATER), points), [False, True, True, True])
+    image = render_points(small, tube_of(WATER), Balls(points[1:], 1.0, 0.05), rng, rays=100)
     assert not image.any()
     # Same bits for any number of threads.
     balls = Balls(np.array([[0.05, -0.1, 3.0], [-0.2, 0.1, -4.0], [0.0, 4.97, 0.0]]), 1.0, 0.05)
-    images = [render_points(small, tube(), balls, np.random.default_rng(5), rays=500)]
+    images = [render_points(small, tube_of(WATER), balls, np.random.default_rng(5), rays=500)]
     with one_thread():
-        images.append(render_points(small, tube(), balls, np.random.default_rng(5), rays=500))
+        images.append(render_points(small, tube_of(WATER), balls, np.random.default_rng(5), rays=500))
     np.testing.assert_array_equal(*images)
 
 
@@ -127,8 +123,8 @@ def test_a_thin_wall_hides_what_no_ray_passes(camera: Camera) -> None:
     farthest = np.max(in_air / 1.33 / np.cos(along - turn + aside))
     r = np.linspace(0.0, 4.99, 500)
     points = np.stack([0.0 * r, r * np.cos(along), r * np.sin(along)], axis=1)
-    assert not unseen(camera, tube(7.0), points).any()
-    hidden = unseen(camera, tube(outer), points)
+    assert not unseen(camera, tube_of(WATER), points).any()
+    hidden = unseen(camera, tube_of(WATER, outer_mm=outer), points)
     assert np.all(np.diff(hidden.astype(int)) >= 0)
     assert farthest < 4.3
     # places on the lens are not asked for its very rim

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -13,18 +14,14 @@ from lfpiv_cli.names import ColumnAxis
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.curved_space import CurvedSpace, Face, aim, trace_in
 from lfpiv_cli.optics.media import Media, Window, fluid_path_to_focus
-from lfpiv_cli.optics.shapes import Vector
 from lfpiv_cli.optics.surfaces import Cylinder, Plane, Sphere, Surface, TiltedPlane
 from lfpiv_cli.optics.tracing import ObjectSpace, disc_points
-from tests.known_rays import assert_rays_go_back, rays_from_air, rays_to_air, slopes_exact
+from tests.known_rays import assert_rays_go_back, rays_from_air, rays_to_air, slopes_exact, tube_of
 
 WATER = Media(1.0, 1.49, 1.33)
 # An acrylic tube: inner diameter 10 mm, wall 2 mm.
 OUTER_MM, INNER_MM = 7.0, 5.0
-
-
-def tube(axis: Vector = (1.0, 0.0, 0.0), centre: Vector = (0.0, 0.0, 0.0)) -> CurvedSpace:
-    return stack((Cylinder(centre, axis, OUTER_MM), 1.49), (Cylinder(centre, axis, INNER_MM), 1.33))
+tube = partial(tube_of, WATER)
 
 
 def stack(*faces: tuple[Surface, float], air: float = 1.0) -> CurvedSpace:

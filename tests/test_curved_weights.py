@@ -20,7 +20,7 @@ from lfpiv_cli.optics.camera import Lattice
 from lfpiv_cli.optics.curved_space import CurvedSpace, Face
 from lfpiv_cli.optics.media import Window, fluid_path_to_focus
 from lfpiv_cli.optics.shapes import HeightMap
-from lfpiv_cli.optics.surfaces import Cylinder, Plane, Sphere, TiltedPlane
+from lfpiv_cli.optics.surfaces import Plane, Sphere, TiltedPlane
 from lfpiv_cli.optics.tracing import ObjectSpace
 from lfpiv_cli.reconstruction.solvers import SolverSettings, reconstruct
 from lfpiv_cli.verbs.build_weights import BuildWeightsOptions, build_weights_file, misfit_notices
@@ -35,6 +35,7 @@ from lfpiv_cli.weights.quadrature import RayCount, count_rays, integrate_columns
 from lfpiv_cli.weights.scene import aimed_misfit_mm, curved_padding, lit_voxels, places_on_array
 from lfpiv_cli.weights.strips import DEGREE_ALONG, StripOperator, evenly_spread, fit_axis, fit_part, mixed_shares
 from tests.commands import table2_rig
+from tests.known_rays import tube_of
 from tests.operators import assert_adjoint, column_image
 
 VOXEL = (0.1, 0.1, 0.1)
@@ -68,12 +69,7 @@ def adjoint_reference(operator: StripOperator, image: Singles) -> Floats:
 @pytest.fixture
 def tube(water):
     """A tube of 10 mm with a wall of 2 mm, along x."""
-    return tube_along((1.0, 0.0, 0.0), water)
-
-
-def tube_along(axis, media):
-    walls = ((7.0, media.window), (5.0, media.fluid))
-    return CurvedSpace(media, tuple(Face(Cylinder((0.0, 0.0, 0.0), axis, radius), index) for radius, index in walls))
+    return tube_of(water)
 
 
 def differences_from_counts(camera, space, places, rays):
@@ -145,12 +141,12 @@ def test_plane_faces_have_the_weights_of_plane_layers(table2, water, window, pla
 def test_strips_are_adjoint_and_light_what_columns_say(table2, water, rng, column_axis, axis):
     camera = replace(table2, columns=2000, rows=2000, column_axis=column_axis)
     grid = BESIDE if axis[0] else Grid(*((each[1], each[0], each[2]) for each in vars(BESIDE).values()))
-    operator = operator_of(camera, tube_along(axis, water), grid)
+    operator = operator_of(camera, tube_of(water, axis), grid)
     assert isinstance(operator, StripOperator)
     assert operator.turned == ((column_axis == "x") != bool(axis[0]))
     weights = Weights(grid, (0, 0, 0), operator, column_axis)
     assert_adjoint(weights, rng)
-    layout = OnDemandOperator(camera, tube_along(axis, water), grid)
+    layout = OnDemandOperator(camera, tube_of(water, axis), grid)
     errors = []
     for index in list(np.ndindex(*operator.shape))[::41]:
         alone = np.zeros(operator.shape, np.float32)
@@ -186,7 +182,7 @@ ASLANT = (1.0, np.tan(np.deg2rad(0.5)), np.tan(np.deg2rad(-0.3)))
 
 @pytest.mark.thorough
 def test_strips_follow_a_tube_that_runs_a_little_aslant(table2, water, rng, monkeypatch):
-    camera, tube = replace(table2, columns=1000, rows=2000), tube_along(ASLANT, water)
+    camera, tube = replace(table2, columns=1000, rows=2000), tube_of(water, ASLANT)
     grid = Grid.centred((32, 20, 5), (0.1, 0.1, 0.4), (0.6, 2.6, 2.6))
     operator = operator_of(camera, tube, grid)
     assert isinstance(operator, StripOperator)
@@ -201,7 +197,7 @@ def test_strips_follow_a_tube_that_runs_a_little_aslant(table2, water, rng, monk
         np.testing.assert_allclose(operator.forward(alone), column, atol=1e-8)
         converged = integrate_columns(camera, tube, layout.centres_mm(np.array([flat])), layout.sides_mm, 128, 5)
         errors.append(np.abs(column - converged.image(0, operator.image_shape)).sum())
-    straight = operator_of(camera, tube_along((1.0, 0.0, 0.0), water), grid)
+    straight = operator_of(camera, tube_of(water), grid)
     for of in (np.median, np.max):
         assert of(errors) < of(straight.misfit_l1) + 0.004  # what mixing may cost
         assert of(operator.misfit_l1) == pytest.approx(of(errors), abs=0.01)  # what it says of itself
@@ -284,7 +280,7 @@ def test_what_does_not_separate_is_made_on_demand(table2, tube, water):
     assert isinstance(operator_of(turned, tube, grid), OnDemandOperator)
     # The tube across the image, which no strips of rows or columns follow.
     oblique = Grid.centred((30, 30, 5), (0.2, 0.2, 1.5), (0.0, 0.0, 0.0))
-    assert isinstance(operator_of(table2, tube_along((1.0, 1.0, 0.0), water), oblique), OnDemandOperator)
+    assert isinstance(operator_of(table2, tube_of(water, (1.0, 1.0, 0.0)), oblique), OnDemandOperator)
 
 
 @pytest.mark.parametrize("operator_kind", ["strips", "on demand"])
@@ -359,7 +355,7 @@ def test_a_weights_file_holds_every_kind_of_face(table2, water, tmp_path, surfac
 def test_transmission_scales_pixels_of_turned_strips(table2, water, rng):
     camera = replace(table2, columns=1768, rows=300)
     grid = Grid.centred((20, 4, 3), (0.1, 0.1, 1.0), (2.6, 0.1, 0.0))
-    operator = operator_of(camera, tube_along((0.0, 1.0, 0.0), water), grid)
+    operator = operator_of(camera, tube_of(water, (0.0, 1.0, 0.0)), grid)
     assert operator.turned
     passing, volume = rng.random(operator.image_shape, np.float32), rng.random(operator.shape, np.float32)
     dimmed = operator.behind(passing).forward(volume)

@@ -10,14 +10,14 @@ from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.optics.camera import Camera, Lattice
 from lfpiv_cli.optics.curved_space import CurvedSpace, Face
 from lfpiv_cli.optics.media import Media, Window
-from lfpiv_cli.optics.surfaces import Cylinder, Plane
+from lfpiv_cli.optics.surfaces import Plane
 from lfpiv_cli.optics.tracing import ObjectSpace, disc_points, trace
 from lfpiv_cli.particles.fitting import add_all, refine
 from lfpiv_cli.particles.least_squares import lit_by, observation_of, respond_all, room_for
 from lfpiv_cli.particles.pencil import MEAN_SQUARE, NODES, WEIGHTS, cubic_at, pencil_of
 from lfpiv_cli.particles.refraction import on_line_of_sight, places_by_snell
 from lfpiv_cli.particles.view import View, entry_capacity, footprint_radius_mm, on_array_mm, raw_view, tile_side_mm
-from tests.known_rays import image_of
+from tests.known_rays import image_of, tube_of
 from tests.particle_images import light_on
 from tests.particle_twin import respond_once
 
@@ -26,12 +26,6 @@ DEPTHS = (-4.5, 4.5)
 # On the axis of the pipe, in focus along it and across it; at its sides, near both depths; close to the wall.
 PLACES = [(0.3, 0.1, 3.0), (0.3, 0.1, -1.2), (-0.5, 3.0, 1.0), (-0.5, 3.0, -2.0)]
 PLACES += [(0.4, 4.5, 0.5), (0.4, -4.5, -1.2), (0.4, -4.3, -2.0)]
-
-
-def pipe(water: Media, axis: tuple[float, float, float] = (1.0, 0.0, 0.0)) -> CurvedSpace:
-    """Return an acrylic pipe of 10 mm inside, full of water."""
-    faces = (Face(Cylinder((0.0, 0.0, 0.0), axis, 7.0), 1.49), Face(Cylinder((0.0, 0.0, 0.0), axis, 5.0), 1.33))
-    return CurvedSpace(water, faces)
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +37,7 @@ def camera(table2: Camera) -> Camera:
 
 @pytest.fixture(scope="module")
 def view(camera: Camera, water: Media) -> View:
-    return raw_view(camera, water, RADIUS_MM, space=pipe(water))
+    return raw_view(camera, water, RADIUS_MM, space=tube_of(water))
 
 
 def images(view: View, point: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -73,10 +67,10 @@ def counted(camera: Camera, space: CurvedSpace, point: tuple[float, float, float
 def test_response_is_what_rays_through_the_pipe_make(
     camera: Camera, water: Media, place: tuple[float, float, float], turned: bool
 ) -> None:
-    space = pipe(water)
+    space = tube_of(water)
     if turned:
         camera, place = replace(camera, columns=camera.rows, rows=camera.columns), (place[1], place[0], place[2])
-        space = pipe(water, (0.0, 1.0, 0.0))
+        space = tube_of(water, (0.0, 1.0, 0.0))
     view = raw_view(camera, water, RADIUS_MM, space=space)
     response = images(view, np.array(place))
     rays = 500_000
@@ -146,7 +140,7 @@ def test_the_line_is_closest_to_the_slopes(camera: Camera, water: Media) -> None
     np.testing.assert_allclose(WEIGHTS @ NODES**2, MEAN_SQUARE, rtol=1e-14)
     # Mean of u^6 over the disc: 5/64.
     np.testing.assert_allclose(WEIGHTS @ NODES**6, 5.0 / 64.0, rtol=1e-14)
-    space, radius = pipe(water), camera.aperture_radius_mm
+    space, radius = tube_of(water), camera.aperture_radius_mm
     crossing = disc_points(2000, radius, np.random.default_rng(2))
     for place in ((0.4, 3.0, 1.0), (-0.3, -4.8, 0.0)):
         pencil = pencil_of(space.for_kernels(camera), radius, *place)
@@ -193,7 +187,7 @@ def test_what_the_wall_hides_has_no_light_and_footprints_hold_the_rest(view: Vie
 def test_lines_of_sight_are_rays(camera: Camera, water: Media, view: View) -> None:
     x, y = on_line_of_sight(view, 0.4, 4.0, 0.5, -1.5)
     ends = np.array([(0.4, 4.0, 0.5), (x, y, -1.5)])
-    slopes, _ = pipe(water).slopes(camera, ends, np.zeros((2, 2)))
+    slopes, _ = tube_of(water).slopes(camera, ends, np.zeros((2, 2)))
     np.testing.assert_allclose(slopes[0], slopes[1], atol=1e-9)
 
 
@@ -201,7 +195,7 @@ def test_lines_of_sight_are_rays(camera: Camera, water: Media, view: View) -> No
 @pytest.mark.thorough
 def test_fits_return_to_the_truth_and_scatter_as_stated(camera: Camera, water: Media) -> None:
     rng = np.random.default_rng(8)
-    view = raw_view(replace(camera, columns=260), water, RADIUS_MM, space=pipe(water))
+    view = raw_view(replace(camera, columns=260), water, RADIUS_MM, space=tube_of(water))
     for place in ((0.1, 0.2, 2.5), (-0.1, 3.0, 1.5), (0.1, 4.3, 1.2)):
         true = np.array([[*place, 4e4]])
         model = light_on(view, true, DEPTHS)
@@ -229,4 +223,4 @@ def test_fits_return_to_the_truth_and_scatter_as_stated(camera: Camera, water: M
 def test_hexagonal_arrays_are_refused(table2: Camera, water: Media) -> None:
     hexagonal = replace(table2, lattice=Lattice.regular(0.1, "hexagonal"))
     with pytest.raises(ConfigError, match="square microlenses alone; these are hexagonal"):
-        raw_view(hexagonal, water, RADIUS_MM, space=pipe(water))
+        raw_view(hexagonal, water, RADIUS_MM, space=tube_of(water))

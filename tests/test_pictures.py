@@ -13,9 +13,7 @@ from lfpiv_cli.files.vtkhdf import write_vectors
 from lfpiv_cli.flow.field import MASKED, REJECTED, VALID, VectorField
 from lfpiv_cli.grid import Grid, Reference
 from lfpiv_cli.optics.camera import Camera
-from lfpiv_cli.optics.curved_space import CurvedSpace, Face
 from lfpiv_cli.optics.media import Media
-from lfpiv_cli.optics.surfaces import Cylinder
 from lfpiv_cli.pictures import points as of_points
 from lfpiv_cli.pictures import style
 from lfpiv_cli.pictures import vectors as of_volume
@@ -23,6 +21,7 @@ from lfpiv_cli.pictures import vectors as pictures
 from lfpiv_cli.pictures.statistics import convergence_figure
 from lfpiv_cli.pictures.style import COLOURS, MARKERS, SETTINGS, SLABS, percentiles_by_depth, scale_of, symmetric_limit
 from lfpiv_cli.verbs.plot import figures_of
+from tests.known_rays import tube_of
 
 matplotlib = pytest.importorskip("matplotlib")
 from matplotlib.quiver import Quiver, QuiverKey  # noqa: E402
@@ -44,14 +43,7 @@ def test_particles_are_seen_where_the_camera_sees_them(table2: Camera, water: Me
 
 
 def test_particles_in_a_tube_are_seen_through_its_walls(table2: Camera, water: Media) -> None:
-    tube = CurvedSpace(
-        water,
-        (
-            Face(Cylinder((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), 7.0), 1.49),
-            Face(Cylinder((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), 5.0), 1.33),
-        ),
-    )
-    (seen, hidden) = of_points.places_px(np.array([[0.3, 0.5, 0.0], [0.0, 5.5, 0.0]]), table2, water, tube)
+    (seen, hidden) = of_points.places_px(np.array([[0.3, 0.5, 0.0], [0.0, 5.5, 0.0]]), table2, water, tube_of(water))
     along, across = (seen - table2.sensor_centre_px) * table2.pixel_mm / table2.micro_image_scale / table2.magnification
     # about its axis a tube is a lens: what is near it seems wider by the fluid's index, 1.33, and along it as it is
     assert along == pytest.approx(0.3, rel=0.03)

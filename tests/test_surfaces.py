@@ -16,6 +16,7 @@ from lfpiv_cli.optics.media import Media
 from lfpiv_cli.optics.shapes import HeightMap, Vector
 from lfpiv_cli.optics.surfaces import SURFACES, Cylinder, Faces, Plane, Sphere, Surface, TiltedPlane, meet
 from lfpiv_cli.optics.tracing import disc_points
+from tests.known_rays import tube_of
 
 PLANE = Plane(-3.0)
 TILTED = TiltedPlane((0.5, 0.2, -3.0), (0.1, -0.2, 1.5))
@@ -153,10 +154,7 @@ def test_what_the_optical_axis_never_meets_is_refused(surface: Surface, words: s
 
 
 WATER = Media(1.0, 1.49, 1.33)
-ALONG_X = (1.0, 0.0, 0.0)
-TUBE = CurvedSpace(
-    WATER, (Face(Cylinder((0.0, 0.0, 0.0), ALONG_X, 7.0), 1.49), Face(Cylinder((0.0, 0.0, 0.0), ALONG_X, 5.0), 1.33))
-)
+TUBE = tube_of(WATER)
 BALL = CurvedSpace(WATER, (Face(Sphere((0.0, 0.0, 1.0), 8.0), 1.49), Face(Sphere((0.0, 0.0, 2.0), 6.5), 1.33)))
 # A hollow face in air, and a tilted plane.
 MENISCUS = CurvedSpace(

@@ -21,6 +21,7 @@ from lfpiv_cli.self_calibration.refinement import Refinement
 from lfpiv_cli.self_calibration.scene_refinement import SceneRefinement, together, wall_by_places
 from lfpiv_cli.self_calibration.walls import Walls, find_round_wall, find_walls
 from lfpiv_cli.verbs.refine import scene_notices
+from tests.known_rays import tube_of
 from tests.particle_images import light_on
 
 WIDTH, MIDDLE, SLOPE = 8.0, -0.37, np.array([0.02, -0.013])
@@ -319,8 +320,7 @@ def test_shifts_and_tilts_across_and_away_have_the_signs_of_x_or_y_and_of_z(
 ) -> None:
     space = config.scene_space()
     assert space is not None
-    faces = tuple(Face(Cylinder((0.0, 0.0, 0.0), axis, each), n) for each, n in ((7.0, 1.49), (5.0, 1.33)))
-    scene = MovableScene.of(replace(space, faces=faces), config.camera_model())
+    scene = MovableScene.of(tube_of(space.media, axis), config.camera_model())
     assert scene.across[np.argmax(np.abs(scene.across))] > 0.0 < scene.away[2]
     shifted = scene.motion(np.array([0.1, 0.2, 0.0, 0.0])).points(scene.pivot_mm) - scene.pivot_mm
     np.testing.assert_allclose(shifted, 0.1 * scene.across + 0.2 * scene.away, atol=1e-15)

@@ -16,11 +16,12 @@ from lfpiv_cli.optics import waves
 from lfpiv_cli.optics.camera import Camera, Lattice
 from lfpiv_cli.optics.curved_space import CurvedSpace, Face
 from lfpiv_cli.optics.media import Media, Window, fluid_path_to_focus
-from lfpiv_cli.optics.surfaces import Cylinder, Plane
+from lfpiv_cli.optics.surfaces import Plane
 from lfpiv_cli.optics.tracing import ObjectSpace, disc_points
 from lfpiv_cli.optics.waves import DEGREE, Waves, WavesInCamera, pixel_response
 from lfpiv_cli.synthetic.board import BoardPlacement, render_board, sunflower
 from lfpiv_cli.synthetic.render import Balls, lens_blur_mm, lens_spread, points_in_ball, render_points, render_white
+from tests.known_rays import tube_of
 
 GREEN = Waves(532e-6)
 # Four times as long: a hundredth of the work.
@@ -234,20 +235,14 @@ def test_light_lies_where_rays_end(table2: Camera, distortion: float) -> None:
     assert apart(found, rays) < 0.6
 
 
-def tube(outer: float) -> CurvedSpace:
-    """A pipe of acrylic, filled with water, across the columns."""
-    walls = [(Cylinder((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), radius), n) for radius, n in ((outer, 1.49), (5.0, 1.33))]
-    return CurvedSpace(WATER, tuple(Face(*wall) for wall in walls))
-
-
 @pytest.mark.parametrize("point", [(0.1, 0.3, 0.5), (0.0, 2.5, 2.0), (0.4, -3.5, -2.0)])
 def test_phase_through_a_tube_has_the_rays_for_normals(table2: Camera, point: tuple[float, float, float]) -> None:
-    seen = WavesInCamera(table2, tube(7.0), GREEN)
+    seen = WavesInCamera(table2, tube_of(WATER), GREEN)
     array, lit = seen._rays(np.array(point))  # noqa: SLF001
     middle = array.mean(axis=0)
     phase = seen._phase(array - middle, lit)  # noqa: SLF001
     crossing = disc_points(200, 1.0, np.random.default_rng(0))
-    slopes, _ = tube(7.0).slopes(table2, np.tile(point, (200, 1)), 12.5 * crossing)
+    slopes, _ = tube_of(WATER).slopes(table2, np.tile(point, (200, 1)), 12.5 * crossing)
     exact = 12.5 * crossing + 200.0 * (slopes - 12.5 * crossing / 100.0) - middle
     power = np.arange(DEGREE + 1)
     x, y = (crossing[:, [axis]] ** power for axis in (0, 1))
@@ -263,7 +258,7 @@ def test_phase_through_a_tube_has_the_rays_for_normals(table2: Camera, point: tu
 @pytest.mark.thorough
 def test_what_a_wall_hides_is_dark(table2: Camera) -> None:
     """Behind a thin wall light from near the rim is totally reflected, from some points a part of it."""
-    camera, thin, rays = replace(table2, columns=400, rows=2352), tube(5.5), []
+    camera, thin, rays = replace(table2, columns=400, rows=2352), tube_of(WATER, outer_mm=5.5), []
     for y in (3.2, 3.3, 3.4):
         rays.append(by_rays(camera, (0.0, y, 2.5), thin, rays=20_000).sum())
         assert by_waves(camera, (0.0, y, 2.5), space=thin).sum() == pytest.approx(rays[-1], abs=0.02)
