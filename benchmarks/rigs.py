@@ -194,7 +194,12 @@ def experiment(rig: DrawnRig, folder: Path, outcome: Outcome, volumes: bool) -> 
     if rig.haze:
         veil(images, rig)
     soil(images, rig)
-    truth = truth_of(load_rig(true), images, load_rig(reported).grid())
+    try:
+        truth = truth_of(load_rig(true), images, load_rig(reported).grid())
+    except LfpivError as error:
+        # What its owner believes of a rig cannot be.
+        outcome.steps.append(Step(BEFORE_THE_WORK[0], error.exit_code, str(error), [], 0.0))
+        return
 
     def done(*arguments: object) -> bool:
         outcome.steps.append(run_command(*arguments))
