@@ -280,23 +280,27 @@ def test_verdicts_and_their_summary() -> None:
     assert "there is no room" in text
 
 
-@pytest.mark.slow
-def test_a_tiny_rig_is_run_and_judged_and_not_run_again(
+def test_rigs_in_a_file_are_not_run_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    drawn = (draw(SEED, number, (24, 20)) for number in range(40))
-    rig = next(rig for rig in drawn if 3 <= rig.true["simulation"]["particles"] <= 60)
-    outcome = run_rig(rig, tmp_path)
-    # A file of what was run before is all that is looked at.
-    monkeypatch.setattr(rigs, "run_rig", lambda *_: outcome)
-    arguments = ["--only", str(rig.number), "--out", str(tmp_path / "runs.jsonl")]
+    steps = [Step("track", 0, "", ["lfpiv: odd [wrong-links]"], 1.0)]
+    outcome = Outcome(3, "a rig", "", ("haze",), steps, {"recall": 0.9, "bright": 1.0})
+    monkeypatch.setattr(rigs, "run_rig", lambda *_: rigs.judged(outcome))
+    arguments = ["--only", "3", "--hard", "--lenses", "24", "20", "--out", str(tmp_path / "runs.jsonl")]
     rigs.bench_rigs(arguments)
     first = capsys.readouterr().out
     monkeypatch.delattr(rigs, "run_rig")
     rigs.bench_rigs(arguments)
-    assert first.endswith(capsys.readouterr().out)
-    assert "1 rigs: " in first
-    assert outcome.verdict in ("worked", "refused", "failed", "warned", "silent")
+    assert first == row(outcome) + "\n" + capsys.readouterr().out
+    assert "warned although right: rig 3: wrong-links" in first
+
+
+@pytest.mark.slow
+def test_a_tiny_rig_is_run_and_judged(tmp_path: Path) -> None:
+    drawn = (draw(SEED, number, (24, 20)) for number in range(40))
+    rig = next(rig for rig in drawn if 3 <= rig.true["simulation"]["particles"] <= 60)
+    outcome = run_rig(rig, tmp_path)
+    assert outcome.verdict in ("worked", "refused", "failed", "unknown", "warned", "silent")
     assert outcome.steps[0].command == "calibrate-snapshot"
     assert not [step for step in outcome.steps if step.exit_code == 1], row(outcome)
 
