@@ -164,7 +164,6 @@ def _join(view: View, projection: Projection, bend: Bend, lens: Lens, pixels: ND
     bent = lens.bent
     per_x = 1.0 / (of_x.stretch * (of_x.alpha * place_x - of_x.beta) + bent.gain_x * place_x)
     per_y = 1.0 / (of_y.stretch * (of_y.alpha * place_y - of_y.beta) + bent.gain_y * place_y)
-    inside = max(camera.aperture_radius_mm - 0.71 * width, 0.0) ** 2
     outside = (camera.aperture_radius_mm + 0.71 * width) ** 2
     for m in range(rows):
         v0, v1 = along_y[MEAN, m], along_y[SLOPE, m]
@@ -176,25 +175,18 @@ def _join(view: View, projection: Projection, bend: Bend, lens: Lens, pixels: ND
             if r2 >= outside:
                 continue
             h0, h0_x, h0_z = along_x[MEAN, n], along_x[MEAN_X, n], along_x[MEAN_Z, n]
-            if r2 <= inside:
-                light, by_x, by_y = h0 * v0, h0_x * v0, h0 * v0_y
-                # Along each axis the depth is another one's change.
-                by_z_x, by_z_y = h0_z * v0, h0 * v0_z
-            else:
-                h1, h1_x, h1_z = along_x[SLOPE, n], along_x[SLOPE_X, n], along_x[SLOPE_Z, n]
-                # Light from one side of the ball crossed the main lens elsewhere than light from its middle.
-                rim_x = patch_x + place_x * of_x.ball * along_x[AWAY, n] / max(h0, SMALLEST_SHARE)
-                rim_y = patch_y + place_y * of_y.ball * along_y[AWAY, m] / max(v0, SMALLEST_SHARE)
-                share, mean_x, mean_y, share_x, share_y = covered_share(
-                    rim_x, rim_y, width, camera.aperture_radius_mm, view.table, view.table_reach
-                )
-                light = share * h0 * v0 + mean_x * h1 * v0 + mean_y * h0 * v1
-                by_x = share * h0_x * v0 + mean_x * h1_x * v0 + mean_y * h0_x * v1 + share_x * place_x * h0 * v0
-                by_y = share * h0 * v0_y + mean_x * h1 * v0_y + mean_y * h0 * v1_y + share_y * place_y * h0 * v0
-                by_z_x = share * h0_z * v0 + mean_x * h1_z * v0 + mean_y * h0_z * v1
-                by_z_x += share_x * (of_x.x - patch_x) * tilt_x * h0 * v0
-                by_z_y = share * h0 * v0_z + mean_x * h1 * v0_z + mean_y * h0 * v1_z
-                by_z_y += share_y * (of_y.x - patch_y) * tilt_y * h0 * v0
+            h1, h1_x, h1_z = along_x[SLOPE, n], along_x[SLOPE_X, n], along_x[SLOPE_Z, n]
+            # Light from one side of the ball crossed the main lens elsewhere than light from its middle.
+            rim_x = patch_x + place_x * of_x.ball * along_x[AWAY, n] / max(h0, SMALLEST_SHARE)
+            rim_y = patch_y + place_y * of_y.ball * along_y[AWAY, m] / max(v0, SMALLEST_SHARE)
+            share, mean_x, mean_y, share_x, share_y = covered_share(rim_x, rim_y, width, camera.aperture_radius_mm)
+            light = share * h0 * v0 + mean_x * h1 * v0 + mean_y * h0 * v1
+            by_x = share * h0_x * v0 + mean_x * h1_x * v0 + mean_y * h0_x * v1 + share_x * place_x * h0 * v0
+            by_y = share * h0 * v0_y + mean_x * h1 * v0_y + mean_y * h0 * v1_y + share_y * place_y * h0 * v0
+            by_z_x = share * h0_z * v0 + mean_x * h1_z * v0 + mean_y * h0_z * v1
+            by_z_x += share_x * (of_x.x - patch_x) * tilt_x * h0 * v0
+            by_z_y = share * h0 * v0_z + mean_x * h1 * v0_z + mean_y * h0 * v1_z
+            by_z_y += share_y * (of_y.x - patch_y) * tilt_y * h0 * v0
             slope_x, slope_y = displaced(bend, patch_x, patch_y)
             more_x = of_x.stretch * camera.image_distance_mm * slope_x - bent.x - bent.gain_x * patch_x
             more_y = of_y.stretch * camera.image_distance_mm * slope_y - bent.y - bent.gain_y * patch_y

@@ -10,7 +10,7 @@ from lfpiv_cli.names import Layout
 from lfpiv_cli.optics.camera import Camera, Lattice
 from lfpiv_cli.optics.media import Media, Window, exact_lateral_mm
 from lfpiv_cli.optics.tracing import ObjectSpace
-from lfpiv_cli.particles.cells import cell_shares, covered_share, level_at, rim_table, share_at
+from lfpiv_cli.particles.cells import cell_shares, covered_share, level_at, share_at
 from lfpiv_cli.particles.fitting import add_all, refine
 from lfpiv_cli.particles.least_squares import lit_by, observation_of, respond_all, room_for
 from lfpiv_cli.particles.noise import Noise, pixel_weights
@@ -108,16 +108,15 @@ def test_distortion_moves_the_light_and_each_lens_has_its_own_centre(view: View)
 
 
 def test_rim_shares_are_areas() -> None:
-    table, reach = rim_table(12.5, 1.375)
     rng = np.random.default_rng(3)
     for x, y in rng.uniform(-13.0, 13.0, (30, 2)):
         u, v = np.meshgrid(*[(np.arange(200) + 0.5) / 100 - 1.0] * 2)
         covered = np.hypot(x + u * 0.6875, y + v * 0.6875) <= 12.5
-        share, mean_x, mean_y, *_ = covered_share(x, y, 1.375, 12.5, table, reach)
-        assert share == pytest.approx(covered.mean(), abs=4e-3)
+        share, mean_x, mean_y, *_ = covered_share(x, y, 1.375, 12.5)
+        assert share == pytest.approx(covered.mean(), abs=7e-3)
         assert (mean_x, mean_y) == pytest.approx(((u * covered).mean(), (v * covered).mean()), abs=6e-3)
     for at in (12.1, 12.3, 12.5, 12.8):
-        share, _, _, slope, _ = covered_share(at, 0.0, 1.2, 12.5, table, reach)
+        share, _, _, slope, _ = covered_share(at, 0.0, 1.2, 12.5)
         # The rim is 0.005 of a patch lower at its ends; patches of the table's own width would be off by up to 0.04.
         assert share == pytest.approx(0.5 + (12.5 - at) / 1.2, abs=0.01)
         assert slope == pytest.approx(-1.0 / 1.2, rel=0.05)

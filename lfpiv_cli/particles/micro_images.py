@@ -14,6 +14,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from lfpiv_cli.arrays import Floats
+from lfpiv_cli.particles.cells import covered_share
 from lfpiv_cli.threads import COUNT_NO_REFERENCES
 
 # Pixels of a row that one lens may show, and how many are worked on together.
@@ -31,8 +32,6 @@ RIM, SHOWN, DOWN = 8 * STRIDE, 13 * STRIDE, 17 * STRIDE
 TABLE_SIZE = 25 * STRIDE
 # Of a ball; what sees less sees nothing.
 SMALLEST_SHARE = 1e-9
-# Of areas that divide, mm^2: a patch on the axis.
-TINY = 1e-12
 # Numbers that pixels follow from beside profiles, see `join_row` and `join_curved_row`.
 JOIN_NUMBERS, CURVED_NUMBERS, OF_CUBIC = 24, 33, 21
 
@@ -80,57 +79,30 @@ def fill_profile(out: Floats, count: int, numbers: tuple[float, ...]) -> None:
 
 
 @njit(**VECTORISED)
-def leave_whole(table: Floats, columns: tuple[int, int]) -> None:
-    """Fill in that the rim leaves all of the patches of some columns, the first and their number."""
-    for begin in range(0, columns[1], WIDTH):
-        rows = table[RIM + columns[0] + begin :]
-        for n in range(WIDTH):
-            rows[n] = 1.0
-            rows[STRIDE + n] = rows[2 * STRIDE + n] = rows[3 * STRIDE + n] = rows[4 * STRIDE + n] = 0.0
-
-
-@njit(**VECTORISED)
-def cover_row(table: Floats, columns: tuple[int, int], row: int, shares: Floats, numbers: tuple[float, ...]) -> None:
+def cover_row(
+    table: Floats, columns: tuple[int, int], row: int, whole: tuple[int, int], width: float, radius: float
+) -> None:
     """Fill in what the rim leaves of the patches of some columns of one row; see `cells.covered_share`.
 
     Parameters
     ----------
     columns : the first and their number
-    shares : see `cells.rim_table`
-    numbers : radius of the main lens; a patch's width and 1/width; steps of the table of shares to a patch's width, and
-        to a quadrant times the width; where its distances have the rim, in steps; places just before its last entries;
-        and the square of how far from the axis patches are whole
+    whole : the first one of which it leaves all, and the one behind the last
+    width, radius : of a patch, and of the main lens
     """
-    radius, width, per_width, distances, directions, at_rim, last_distance, last_direction, inside = numbers
-    y, patch_y = table[DOWN + SEEN_FROM + row], table[DOWN + PATCH + row]
-    # Of the first quadrant; the others are its mirror images.
-    down, above = abs(y), -1.0 if y < 0.0 else 1.0
-    rows = table[columns[0] :]
-    for n in range(columns[1]):
-        patch_x = rows[PATCH + n]
-        share, mean_x, mean_y, slope_x, slope_y = 1.0, 0.0, 0.0, 0.0, 0.0
-        if patch_x * patch_x + patch_y * patch_y > inside:
-            x = rows[SEEN_FROM + n]
-            right, left = abs(x), -1.0 if x < 0.0 else 1.0
-            away, around = np.sqrt(x * x + y * y), right + down
-            # What counts is how many of its widths a patch is from the rim. One division: widths over both.
-            per = per_width / max(away * around, TINY)
-            per_away, per_around = per * around, per * away
-            p = min(max((away - radius) * per_width * distances + at_rim, 0.0), last_distance)
-            q = min(down * per_around * directions, last_direction)
-            i, j = int(p), int(q)
-            p, q = p - i, q - j
-            a, b, c, d = shares[j, i], shares[j, i + 1], shares[j + 1, i], shares[j + 1, i + 1]
-            ka, kb, kc, kd = (1.0 - p) * (1.0 - q), p * (1.0 - q), (1.0 - p) * q, p * q
-            share = ka * a[0] + kb * b[0] + kc * c[0] + kd * d[0]
-            mean_x = left * (ka * a[1] + kb * b[1] + kc * c[1] + kd * d[1])
-            mean_y = above * (ka * a[2] + kb * b[2] + kc * c[2] + kd * d[2])
-            outwards = ((1.0 - q) * (b[0] - a[0]) + q * (d[0] - c[0])) * per_away * distances
-            turning = ((1.0 - p) * (c[0] - a[0]) + p * (d[0] - b[0])) * per_around * per_around * directions * width
-            slope_x = left * (outwards * right - turning * down)
-            slope_y = above * (outwards * down + turning * right)
-        rows[RIM + n], rows[RIM + STRIDE + n], rows[RIM + 2 * STRIDE + n] = share, mean_x, mean_y
-        rows[RIM + 3 * STRIDE + n], rows[RIM + 4 * STRIDE + n] = slope_x, slope_y
+    y = table[DOWN + SEEN_FROM + row]
+    for begin in range(columns[0], columns[0] + columns[1], WIDTH):
+        rows = table[begin:]
+        if whole[0] <= begin and min(begin + WIDTH, columns[0] + columns[1]) <= whole[1]:
+            for n in range(WIDTH):
+                rows[RIM + n] = 1.0
+                rows[RIM + STRIDE + n] = rows[RIM + 2 * STRIDE + n] = 0.0
+                rows[RIM + 3 * STRIDE + n] = rows[RIM + 4 * STRIDE + n] = 0.0
+            continue
+        for n in range(WIDTH):
+            share, mean_x, mean_y, slope_x, slope_y = covered_share(rows[SEEN_FROM + n], y, width, radius)
+            rows[RIM + n], rows[RIM + STRIDE + n], rows[RIM + 2 * STRIDE + n] = share, mean_x, mean_y
+            rows[RIM + 3 * STRIDE + n], rows[RIM + 4 * STRIDE + n] = slope_x, slope_y
 
 
 @njit(**VECTORISED)

@@ -303,8 +303,6 @@ def join_cell(
                     patch_y + away * by_v,
                     width,
                     camera.aperture_radius_mm,
-                    view.table,
-                    view.table_reach,
                 )
                 lean_x, lean_y = mean_x * half_x, mean_y * half_y
                 light = share * part + lean_x * by_u + lean_y * by_v

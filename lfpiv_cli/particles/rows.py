@@ -16,7 +16,6 @@ from numba import njit
 from numpy.typing import NDArray
 
 from lfpiv_cli.arrays import Floats
-from lfpiv_cli.particles.cells import DIRECTIONS, DISTANCES
 from lfpiv_cli.particles.micro_images import (
     CURVED_NUMBERS,
     DOWN,
@@ -29,7 +28,6 @@ from lfpiv_cli.particles.micro_images import (
     fill_profile,
     join_curved_row,
     join_row,
-    leave_whole,
     take_row,
 )
 from lfpiv_cli.particles.pencil import in_row
@@ -203,7 +201,10 @@ def _write_lens(
     lit = (row, rows), (column, columns)
     far = camera.image_distance_mm
     rises = bent.gain_x / (x.stretch * far), bent.gain_y / (y.stretch * far)
-    return _write_rows(view, (bend.cubic, rises), lit, (step_x, width), begin, pixels, values, room, rectangle)
+    # How far from a patch the edge of the ball is seen from, at most.
+    away = np.hypot(x.lever * x.beta * x.ball / x.scale, y.lever * y.beta * y.ball / y.scale)
+    patches = step_x, width, away
+    return _write_rows(view, (bend.cubic, rises), lit, patches, begin, pixels, values, room, rectangle)
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
@@ -260,7 +261,7 @@ def _write_rows(
     view: View,
     bent: tuple[Floats, tuple[float, float]],
     lit: tuple[tuple[int, int], tuple[int, int]],
-    patches: tuple[float, float],
+    patches: tuple[float, float, float],
     begin: int,
     pixels: NDArray[np.int32],
     values: Floats,
@@ -273,25 +274,15 @@ def _write_rows(
     ----------
     bent : `Bend.cubic`, and the slopes of its tangents that profiles follow already
     lit : first row and their number, first column and their number
-    patches : the step along x from one to the next, and their mean width
+    patches : the step along x from one to the next, their mean width, and how far from them a ball is seen from at most
     """
     camera = view.camera
     (row, rows), (column, columns) = lit
     cubic, tangent = bent
-    step, width = patches
+    step, width, away = patches
     outside = _far(view, width)
-    inside = max(camera.aperture_radius_mm - 0.71 * width, 0.0) ** 2
-    rim_numbers = (
-        camera.aperture_radius_mm,
-        width,
-        1.0 / width,
-        0.5 * (DISTANCES - 1.0) / view.table_reach,
-        (DIRECTIONS - 1.0) * width,
-        0.5 * (DISTANCES - 1.0),
-        DISTANCES - 1.001,
-        DIRECTIONS - 1.001,
-        inside,
-    )
+    # Of patches that the rim, with its sagitta, does not touch, seen from wherever they are.
+    inside = max(camera.aperture_radius_mm - 0.75 * width - away, 0.0) ** 2
     table, first = room.table, room.table[PATCH]
     at = begin
     rectangle[1], rectangle[2], rectangle[3], rectangle[4] = row + rows, -1, column + columns, -1
@@ -300,12 +291,8 @@ def _write_rows(
         low, high = _columns_within(outside - y * y, first, step, columns)
         if low >= high or at + high - low + SLACK > pixels.size:
             continue
-        whole_low, whole_high = _columns_within(inside - y * y, first, step, columns)
-        chosen = (low, high - low)
-        if whole_low == low and whole_high == high:
-            leave_whole(table, chosen)
-        else:
-            cover_row(table, chosen, m, view.table, rim_numbers)
+        chosen, whole = (low, high - low), _columns_within(inside - y * y, first, step, columns)
+        cover_row(table, chosen, m, whole, width, camera.aperture_radius_mm)
         if cubic.shape[0] > 0:
             _set_row(cubic, tangent, y, room.numbers)
             join_curved_row(table, chosen, m, room.numbers)

@@ -27,7 +27,7 @@ from lfpiv_cli.optics.line_responses import NO_LINES, LineResponses, line_respon
 from lfpiv_cli.optics.media import Layers, Media
 from lfpiv_cli.optics.surfaces import Faces
 from lfpiv_cli.optics.tracing import ObjectSpace
-from lfpiv_cli.particles.cells import NO_SHARES, cell_shares, hexagon_radius, rim_table, smallest_ball_mm
+from lfpiv_cli.particles.cells import NO_SHARES, cell_shares, hexagon_radius, smallest_ball_mm
 from lfpiv_cli.particles.pencil import lines_of
 from lfpiv_cli.threads import in_threads
 from lfpiv_cli.weights.scene import NO_FACES
@@ -56,7 +56,6 @@ class View(NamedTuple):
     particle_radius_mm : of the balls
     centres_mm : (nj, ni, 2) lens centres on the array; entry [j, i] is lens (first_i + i, first_j + j)
     inverse_basis : (2, 2) of the plain lattice, to find lenses
-    table, table_reach : see `cells.rim_table`
     lines : of light as waves, by which all light goes then; empty: light goes by rays
     points, diffusion_px : the same of points of light before charge diffuses, and how far it does
     passed : (pixels,) share of the middle's light that reaches each pixel; empty: all of it
@@ -79,8 +78,6 @@ class View(NamedTuple):
     first_i: int
     first_j: int
     inverse_basis: Floats
-    table: Floats
-    table_reach: float
     lines: LineResponses
     points: LineResponses
     diffusion_px: float
@@ -162,9 +159,6 @@ def raw_view(
         half_x = half_y = hexagon_radius(lattice)
         cell_reach = 2.0 / 3.0
         shares = cell_shares(lattice, radius * camera.image_distance_mm / camera.focus_distance_mm)
-    table, reach = rim_table(
-        camera.aperture_radius_mm, camera.pixel_mm * camera.image_distance_mm / camera.microlens_distance_mm
-    )
     view = View(
         camera=camera.for_kernels(),
         scale=scale,
@@ -183,8 +177,6 @@ def raw_view(
         first_i=int(low_i),
         first_j=int(low_j),
         inverse_basis=np.ascontiguousarray(np.linalg.inv(lattice.basis)),
-        table=table,
-        table_reach=reach,
         lines=NO_LINES,
         points=NO_LINES,
         diffusion_px=0.0,

@@ -26,7 +26,6 @@ from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.curved_space import CurvedSpace
 from lfpiv_cli.optics.shapes import RigidMotion, vector
 from lfpiv_cli.optics.surfaces import Cylinder, Faces
-from lfpiv_cli.particles.cells import rim_table
 from lfpiv_cli.particles.fitting import add_all, refine
 from lfpiv_cli.particles.least_squares import UNKNOWNS, lit_by, observation_of, respond_all, room_for
 from lfpiv_cli.particles.noise import Noise
@@ -276,13 +275,9 @@ class Nuisances:
     def applied(self, view: View, scene: MovableScene | None = None) -> View:
         """Return the view with these changes; those of a scene where there is one, from where it is said to be."""
         camera, shift = view.camera, np.array([self.shift_x_mm, self.shift_y_mm])
-        radius, table, reach = camera.aperture_radius_mm, view.table, view.table_reach
-        if self.aperture_radius_mm != 0.0:
-            radius += self.aperture_radius_mm
-            table, reach = rim_table(radius, camera.pixel_mm * camera.image_distance_mm / camera.microlens_distance_mm)
         camera = camera._replace(
             origin_mm=camera.origin_mm + shift,
-            aperture_radius_mm=radius,
+            aperture_radius_mm=camera.aperture_radius_mm + self.aperture_radius_mm,
             distortion_per_mm2=camera.distortion_per_mm2 + self.distortion_per_mm2,
         )
         if self.particle_radius_mm != 0.0:
@@ -290,8 +285,6 @@ class Nuisances:
         return view._replace(
             camera=camera,
             centres_mm=view.centres_mm + shift,
-            table=table,
-            table_reach=reach,
             faces=view.faces if scene is None else scene.faces(self.scene),
         )
 
