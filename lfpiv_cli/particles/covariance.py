@@ -31,7 +31,6 @@ from lfpiv_cli.particles.least_squares import (
     Observation,
     factored,
     lit_by,
-    respond_all,
     room_for,
     substitute,
 )
@@ -153,7 +152,7 @@ def _slopes_of(
     pixel, slope = np.empty(count * capacity, np.int32), np.empty((count * capacity, UNKNOWNS), np.float32)
     end = 0
     for n in range(count):
-        respond_all(observation.optics, particles[n : n + 1], responses)
+        observation.respond(observation.optics, particles[n : n + 1], responses)
         pixels, values = lit_by(responses, 0)
         for k in range(pixels.size):
             # A pixel that is named again has no light.

@@ -35,7 +35,6 @@ from lfpiv_cli.particles.least_squares import (
     add_light,
     lit_by,
     observation_of,
-    respond_all,
     room_for,
 )
 from lfpiv_cli.particles.rounds import (
@@ -520,7 +519,7 @@ def _fit_each(
     effort = Effort(STEPS, SMALLEST_GAIN)
     choice = Choice(effort, NO_FURTHER, len(starts), 0.0, np.inf)
     for number in numbers:
-        respond_all(observation.optics, tracers[number : number + 1], own)
+        observation.respond(observation.optics, tracers[number : number + 1], own)
         pixels, values = lit_by(own, 0)
         add_light(pixels, values, tracers[number, 3], residual)
         begin_at(sized.optics, tracers[number], depths_mm[number], starts)

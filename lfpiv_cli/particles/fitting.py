@@ -21,6 +21,7 @@ from lfpiv_cli.particles.least_squares import (
     UNKNOWNS,
     Effort,
     Observation,
+    Respond,
     Responses,
     add_light,
     best_light,
@@ -29,7 +30,7 @@ from lfpiv_cli.particles.least_squares import (
     fit,
     lit_by,
     prior_chi2,
-    respond_all,
+    respond_of,
     room_for,
 )
 from lfpiv_cli.particles.refraction import on_line_of_sight
@@ -156,7 +157,7 @@ def fit_best(
     for n in range(len(starts)):
         if np.isnan(starts[n, 0, 2]):
             continue
-        respond_all(view, starts[n], responses)
+        observation.respond(view, starts[n], responses)
         if starts[n, 0, 3] == UNKNOWN_LIGHT:
             pixels, values = lit_by(responses, 0)
             starts[n, 0, 3] = best_light(pixels, values, observation.residual, observation.weight)
@@ -166,7 +167,7 @@ def fit_best(
         if changes[chosen] > promising:
             break
         changes[chosen] = np.inf
-        respond_all(view, starts[chosen], responses)
+        observation.respond(view, starts[chosen], responses)
         change = fit(observation, starts[chosen], prior, responses, choice.then)
         light = starts[chosen, :, 3]
         if change < lowest and choice.faintest <= light.min() and light.max() < choice.brightest:
@@ -238,7 +239,7 @@ def _fit_again(
     for number in numbers:
         copy_rows(particles[number : number + 1], best)
         expected = prior[number : number + 1]
-        respond_all(view, best, responses)
+        observation.respond(view, best, responses)
         pixels, values = lit_by(responses, 0)
         add_light(pixels, values, best[0, 3], residual)
         before = change_by(pixels, values, best[0, 3], residual, observation.weight) + prior_chi2(best, expected)
@@ -253,7 +254,7 @@ def _fit_again(
         refitted.gain[number] = before - after
         copy_rows(best, particles[number : number + 1])
         if depths.shape[1] > 0:
-            respond_all(view, best, responses)
+            observation.respond(view, best, responses)
         pixels, values = lit_by(responses, 0)
         add_light(pixels, values, -best[0, 3], residual)
 
@@ -291,7 +292,7 @@ def _other_ends(
     responses, prior = room_for(1, observation.capacity, 0), np.zeros((1, 2 * UNKNOWNS))
     for number in numbers:
         own, depth = particles[number : number + 1], particles[number, 2]
-        respond_all(view, own, responses)
+        observation.respond(view, own, responses)
         pixels, values = lit_by(responses, 0)
         add_light(pixels, values, own[0, 3], residual)
         before = change_by(pixels, values, own[0, 3], residual, weight)
@@ -299,11 +300,11 @@ def _other_ends(
             end, place = ends[number, k : k + 1], places[number, k]
             end[0, 0], end[0, 1] = on_line_of_sight(view, place[0], place[1], depth, place[2])
             end[0, 2] = place[2]
-            respond_all(view, end, responses)
+            observation.respond(view, end, responses)
             pixels, values = lit_by(responses, 0)
             end[0, 3] = best_light(pixels, values, residual, weight)
             rises[number, k] = fit(observation, end, prior, responses, effort) - before
-        respond_all(view, own, responses)
+        observation.respond(view, own, responses)
         pixels, values = lit_by(responses, 0)
         add_light(pixels, values, -own[0, 3], residual)
 
@@ -362,7 +363,7 @@ def _accept(
         begin_at(observation.optics, candidates[number], depths[number], starts)
         if fit_best(observation, starts, prior, responses, choice, (0.0, -least.gain), best) >= -least.gain:
             continue
-        respond_all(observation.optics, best, responses)
+        observation.respond(observation.optics, best, responses)
         pixels, values = lit_by(responses, 0)
         if seen_share(pixels, values, weight) <= least.seen:
             continue
@@ -375,17 +376,28 @@ def _accept(
 def add_all(view: View, particles: Floats, sign: float, image: Floats, depths_mm: tuple[float, float]) -> None:
     """Add the light of all particles (n, 4) between two depths, times `sign`, to an image."""
     capacity = entry_capacity(view, *depths_mm)
-    over_tiles(lambda numbers: _add_all(view, particles, numbers, sign, image, capacity), view, particles, depths_mm)
+    respond = respond_of(view)
+
+    def work(numbers: NDArray[np.int64]) -> None:
+        _add_all(respond, view, particles, numbers, sign, image, capacity)
+
+    over_tiles(work, view, particles, depths_mm)
 
 
 @njit(cache=True, nogil=True)
 def _add_all(
-    view: View, particles: Floats, numbers: NDArray[np.int64], sign: float, image: Floats, capacity: int
+    respond: Respond,
+    view: View,
+    particles: Floats,
+    numbers: NDArray[np.int64],
+    sign: float,
+    image: Floats,
+    capacity: int,
 ) -> None:
     """Do the work of `add_all` for the particles of a tile."""
     responses = room_for(1, capacity, 0)
     for number in numbers:
-        respond_all(view, particles[number : number + 1], responses)
+        respond(view, particles[number : number + 1], responses)
         pixels, values = lit_by(responses, 0)
         add_light(pixels, values, sign * particles[number, 3], image)
 
@@ -415,7 +427,7 @@ def _judge(
     residual, weight = observation.residual, observation.weight
     responses = room_for(1, observation.capacity, 0)
     for number in numbers:
-        respond_all(observation.optics, particles[number : number + 1], responses)
+        observation.respond(observation.optics, particles[number : number + 1], responses)
         pixels, values = lit_by(responses, 0)
         total = squares = 0.0
         for k in range(pixels.size):

@@ -37,7 +37,6 @@ from lfpiv_cli.particles.least_squares import (
     change_by,
     copy_rows,
     lit_by,
-    respond_all,
     room_for,
 )
 from lfpiv_cli.particles.search import SAME_DEPTHS, SAME_LENSES, State, Task, observed
@@ -231,7 +230,7 @@ def _join(
             continue
         two = 0.0
         for member in (second, first):
-            respond_all(view, particles[member : member + 1], responses)
+            observation.respond(view, particles[member : member + 1], responses)
             pixels, values = lit_by(responses, 0)
             add_light(pixels, values, particles[member, 3], residual)
             two += change_by(pixels, values, particles[member, 3], residual, weight)
@@ -245,6 +244,6 @@ def _join(
             free[first] = free[second] = False
         for member in (first, second):
             if member == first or not joined[number]:
-                respond_all(view, particles[member : member + 1], responses)
+                observation.respond(view, particles[member : member + 1], responses)
                 pixels, values = lit_by(responses, 0)
                 add_light(pixels, values, -particles[member, 3], residual)

@@ -14,17 +14,20 @@ Axes: image axes, mm; light in counts; residual and weights as flat images. A pa
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Callable
+from functools import cache
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
-from numba import njit
+from numba import cfunc, config, float64, njit, typeof, void
+from numba.core.typing.templates import Signature
 from numpy.typing import NDArray
 
 from lfpiv_cli.arrays import Floats
 from lfpiv_cli.particles.line_light import VALUES, respond_by_lines
 from lfpiv_cli.particles.refraction import bend_of
 from lfpiv_cli.particles.rows import SLACK, Scratch, respond_rows, scratch
-from lfpiv_cli.particles.view import LARGEST_MOVE_LENSES, View, entry_capacity
+from lfpiv_cli.particles.view import LARGEST_MOVE_LENSES, View, by_waves, entry_capacity
 from lfpiv_cli.threads import COUNT_NO_REFERENCES
 
 UNKNOWNS = 4
@@ -40,43 +43,6 @@ SMALLEST_GAIN, CHOICE_GAIN, SEARCH_GAIN = 0.01, 1.0, 0.5
 LONGEST_STEP_DEPTHS = 0.5 / 1.064
 # What the compiler may do to sums: add many terms at once. The order is the same for any number of threads.
 SUMS = {"reassoc", "contract", "nsz"}
-
-
-class Observation(NamedTuple):
-    """What particles are fitted to.
-
-    Attributes
-    ----------
-    optics : how particles are seen (numba reserves the name `view`)
-    residual : (pixels,) what the particles leave of the image; kernels keep it up to date
-    weight : (pixels,) 1/variance
-    low_mm, high_mm : depths between which particles stay
-    capacity : entries that a particle can have at most
-    """
-
-    optics: View
-    residual: Floats
-    weight: Floats
-    low_mm: float
-    high_mm: float
-    capacity: int
-
-    @property
-    def depths_mm(self) -> tuple[float, float]:
-        """Between which particles stay."""
-        return self.low_mm, self.high_mm
-
-
-def observation_of(view: View, residual: Floats, weight: Floats, depths_mm: tuple[float, float]) -> Observation:
-    """Return the observation of particles between two depths."""
-    return Observation(view, residual, weight, *depths_mm, entry_capacity(view, *depths_mm))
-
-
-class Effort(NamedTuple):
-    """How far a fit goes: so many steps at most, until one lowers chi-squared by less than `enough`."""
-
-    steps: int
-    enough: float
 
 
 class Responses(NamedTuple):
@@ -99,6 +65,48 @@ class Responses(NamedTuple):
     common: Floats
     picked: Floats
     scratch: Scratch
+
+
+Respond: TypeAlias = Callable[[View, Floats, Responses], None]
+
+
+class Observation(NamedTuple):
+    """What particles are fitted to.
+
+    Attributes
+    ----------
+    respond : see `respond_of`
+    optics : how particles are seen (numba reserves the name `view`)
+    residual : (pixels,) what the particles leave of the image; kernels keep it up to date
+    weight : (pixels,) 1/variance
+    low_mm, high_mm : depths between which particles stay
+    capacity : entries that a particle can have at most
+    """
+
+    respond: Respond
+    optics: View
+    residual: Floats
+    weight: Floats
+    low_mm: float
+    high_mm: float
+    capacity: int
+
+    @property
+    def depths_mm(self) -> tuple[float, float]:
+        """Between which particles stay."""
+        return self.low_mm, self.high_mm
+
+
+def observation_of(view: View, residual: Floats, weight: Floats, depths_mm: tuple[float, float]) -> Observation:
+    """Return the observation of particles between two depths."""
+    return Observation(respond_of(view), view, residual, weight, *depths_mm, entry_capacity(view, *depths_mm))
+
+
+class Effort(NamedTuple):
+    """How far a fit goes: so many steps at most, until one lowers chi-squared by less than `enough`."""
+
+    steps: int
+    enough: float
 
 
 @njit(cache=True)
@@ -308,7 +316,7 @@ def fit(observation: Observation, members: Floats, prior: Floats, responses: Res
         if predicted < effort.enough:
             break
         _move(observation, members, begin, step, trial)
-        respond_all(observation.optics, trial, responses)
+        observation.respond(observation.optics, trial, responses)
         trial_change = _equations(observation, trial, prior, responses, trial_matrix, trial_right)
         last_failed = not trial_change < change
         if last_failed:
@@ -321,7 +329,7 @@ def fit(observation: Observation, members: Floats, prior: Floats, responses: Res
         if gain < effort.enough:
             break
     if last_failed:
-        respond_all(observation.optics, members, responses)
+        observation.respond(observation.optics, members, responses)
     return change
 
 
@@ -371,24 +379,60 @@ def _move(observation: Observation, members: Floats, begin: Floats, step: Floats
         trial[m, 3] = max(trial[m, 3], 0.0)
 
 
-@njit(cache=True)
 def respond_all(view: View, members: Floats, responses: Responses) -> None:
     """Write the responses of one particle or two (k, 4)."""
+    (_respond_by_waves if by_waves(view) else _respond_by_rays)(view, members, responses)
+
+
+def respond_of(view: View) -> Respond:
+    """Return the address of what writes responses, as `respond_all` does, by the view's light.
+
+    Kernels that call a compiled function hold a copy of it, for which it is compiled again; one that is called by its
+    address is compiled once, and only for the light that is asked for.
+    """
+    return _address_of(by_waves(view), void(typeof(view), float64[:, ::1], typeof(room_for(1, 1, 0))))
+
+
+@cache
+def _address_of(waves: bool, signature: Signature) -> Respond:
+    write = _write_by_waves if waves else _write_by_rays
+    address: Respond = write if config.DISABLE_JIT else cfunc(signature, cache=True)(write)
+    return address
+
+
+def _write_by_rays(view: View, members: Floats, responses: Responses) -> None:
+    _respond_by_rays(view, members, responses)
+
+
+def _write_by_waves(view: View, members: Floats, responses: Responses) -> None:
+    _respond_by_waves(view, members, responses)
+
+
+@njit(cache=True)
+def _respond_by_rays(view: View, members: Floats, responses: Responses) -> None:
+    """Write responses by rays."""
     for m in range(members.shape[0]):
-        x, y, z = members[m, 0], members[m, 1], members[m, 2]
         pixels, values = responses.pixels[m], responses.values[m]
-        bend = bend_of(view, x, y, z)
-        if view.lines.table.shape[0] > 0:
-            responses.counts[m] = respond_by_lines(view, bend, z, pixels, values)
-        else:
-            responses.counts[m] = respond_rows(view, bend, pixels, values, responses.scratch)
-        if view.passed.size > 0:
-            _pass(view.passed, pixels[: responses.counts[m]], values)
+        bend = bend_of(view, members[m, 0], members[m, 1], members[m, 2])
+        responses.counts[m] = respond_rows(view, bend, pixels, values, responses.scratch)
+        _pass(view.passed, pixels[: responses.counts[m]], values)
+
+
+@njit(cache=True)
+def _respond_by_waves(view: View, members: Floats, responses: Responses) -> None:
+    """Write responses by waves."""
+    for m in range(members.shape[0]):
+        pixels, values = responses.pixels[m], responses.values[m]
+        bend = bend_of(view, members[m, 0], members[m, 1], members[m, 2])
+        responses.counts[m] = respond_by_lines(view, bend, members[m, 2], pixels, values)
+        _pass(view.passed, pixels[: responses.counts[m]], values)
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
 def _pass(passed: NDArray[np.float32], pixels: NDArray[np.int32], values: Floats) -> None:
-    """Leave of light and its derivatives what reaches the pixels."""
+    """Leave of light and its derivatives what reaches the pixels, all where nothing is known of it."""
+    if passed.size == 0:
+        return
     for k in range(pixels.size):
         share = passed[pixels[k]]
         for m in range(UNKNOWNS):

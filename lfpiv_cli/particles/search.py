@@ -545,7 +545,7 @@ def with_other_places(
     places[:, :, 2] = np.clip(places[:, :, 2], *observation.depths_mm)
 
     # Sideways also as they are: within a lens hardly anything leads a fit back.
-    still = other_ends(observation, particles, near, places[:, :2], Effort(0, 0.0))
+    still = other_ends(observation, particles, near, np.ascontiguousarray(places[:, :2]), Effort(0, 0.0))
     fitted = other_ends(observation, particles, near, places, Effort(OTHER_STEPS, CHOICE_GAIN))
     ends, rises = (np.concatenate(both, axis=1) for both in zip(still, fitted, strict=True))
 

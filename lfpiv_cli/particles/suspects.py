@@ -24,7 +24,6 @@ from lfpiv_cli.particles.least_squares import (
     change_by,
     copy_rows,
     lit_by,
-    respond_all,
     room_for,
 )
 from lfpiv_cli.particles.search import SMALLEST_LIGHT, State, Task, observed, usual_chi2
@@ -99,7 +98,7 @@ def _split(
     for number in numbers:
         one = particles[number : number + 1]
         light = one[0, 3]
-        respond_all(view, one, responses)
+        observation.respond(view, one, responses)
         pixels, values = lit_by(responses, 0)
         add_light(pixels, values, light, residual)
         single = change_by(pixels, values, light, residual, observation.weight)
@@ -115,12 +114,12 @@ def _split(
         if fit_best(observation, starts, prior, responses, choice, limits, best) < limits[1]:
             copy_rows(best[:1], one)
             copy_rows(best[1:], partners[number : number + 1])
-            respond_all(view, best, responses)
+            observation.respond(view, best, responses)
             for m in range(2):
                 pixels, values = lit_by(responses, m)
                 add_light(pixels, values, -best[m, 3], residual)
         else:
-            respond_all(view, one, responses)
+            observation.respond(view, one, responses)
             pixels, values = lit_by(responses, 0)
             add_light(pixels, values, -light, residual)
 

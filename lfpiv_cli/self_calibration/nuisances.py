@@ -27,7 +27,7 @@ from lfpiv_cli.optics.curved_space import CurvedSpace
 from lfpiv_cli.optics.shapes import RigidMotion, vector
 from lfpiv_cli.optics.surfaces import Cylinder, Faces
 from lfpiv_cli.particles.fitting import add_all, refine
-from lfpiv_cli.particles.least_squares import UNKNOWNS, lit_by, observation_of, respond_all, room_for
+from lfpiv_cli.particles.least_squares import UNKNOWNS, Respond, lit_by, observation_of, respond_of, room_for
 from lfpiv_cli.particles.noise import Noise
 from lfpiv_cli.particles.pencil import MEAN_SQUARE, lines_of
 from lfpiv_cli.particles.view import View, entry_capacity, with_radius
@@ -422,9 +422,9 @@ def _freed(own: csc_matrix, column: Floats) -> Floats:
 
 def _columns(view: View, particles: Floats, root_weight: Floats, capacity: int) -> csc_matrix:
     """Return the weighted derivatives by x, y, z and light of each particle, scaled to length 1, as sparse columns."""
-
+    respond = respond_of(view)
     parts = in_threads(
-        lambda part: _entries(view, particles[part], root_weight, capacity), blocks(len(particles), BLOCK)
+        lambda part: _entries(respond, view, particles[part], root_weight, capacity), blocks(len(particles), BLOCK)
     )
     counts, rows, data = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
     starts = np.concatenate([[0], np.cumsum(np.repeat(counts, UNKNOWNS))])
@@ -433,7 +433,7 @@ def _columns(view: View, particles: Floats, root_weight: Floats, capacity: int) 
 
 @njit(cache=True, nogil=True)
 def _entries(
-    view: View, particles: Floats, root_weight: Floats, capacity: int
+    respond: Respond, view: View, particles: Floats, root_weight: Floats, capacity: int
 ) -> tuple[Integers, NDArray[np.int32], Singles]:
     """Return of particles (n, 4) how many pixels each lights, and rows and values of their columns."""
     counts, at = np.zeros(len(particles), np.int64), 0
@@ -441,7 +441,7 @@ def _entries(
     data, rows = np.empty(size, np.float32), np.empty(size, np.int32)
     responses = room_for(1, capacity, 0)
     for n in range(len(particles)):
-        respond_all(view, particles[n : n + 1], responses)
+        respond(view, particles[n : n + 1], responses)
         lit, light = lit_by(responses, 0)
         counts[n] = lit.size
         for k in range(UNKNOWNS):
