@@ -61,9 +61,9 @@ BEFORE_THE_WORK = ("calibrate-snapshot", "build-weights")
 # Standard deviation of a speck's shadow in pixels, and its depth.
 SPECK_PX, SPECK_DEPTH = (0.7, 4.0), (0.1, 0.8)
 # A result is wrong where a slope is off by more (and by more than two of its standard errors), where less than this
-# share of bright tracers is found, where fewer errors lie within 1.96 standard errors, of so many at least, and where
+# share of bright tracers is found, where less than this share of what is found are tracers, where fewer errors lie within 1.96 standard errors, of so many at least, and where
 # less than this share of the tracers found is followed into the second image.
-SMALLEST_TRACKED = 0.5
+SMALLEST_TRACKED, SMALLEST_PRECISION = 0.5, 0.5
 WRONG_SLOPE, SMALLEST_RECALL, SMALLEST_COVERAGE, FEWEST = 0.02, 0.5, 0.8, 20
 # A magnification is wrong that is off by more, and by more than so many of its standard errors.
 WRONG_MAGNIFICATION, WRONG_SIGMAS = 0.002, 3.0
@@ -313,6 +313,8 @@ def faults(figures: Figures) -> list[str]:
         wrong.append(f"magnification {100.0 * figures['magnification_off']:+.2f} %")
     if figures.get("bright", 0.0) >= BRIGHT_SHARE and figures.get("recall", 1.0) < SMALLEST_RECALL:
         wrong.append(f"recall {figures['recall']:.2f}")
+    if figures.get("precision", 1.0) < SMALLEST_PRECISION:
+        wrong.append(f"precision {figures['precision']:.2f}")
     for name in "uvw":
         slope = figures.get(f"slope_{name}")
         if slope is not None and abs(slope - 1.0) > WRONG_SLOPE + 2.0 * figures[f"slope_{name}_sigma"]:
@@ -340,8 +342,10 @@ def verdict(outcome: Outcome) -> str:
         return "refused"
     if outcome.wrong_value in BELIEVED:
         said, share = BELIEVED[outcome.wrong_value]
-        off = abs(outcome.figures.get("slope_w", 1.0) - 1.0) - 2.0 * outcome.figures.get("slope_w_sigma", 0.0)
-        along = all(fault.startswith(("slope w", "coverage z")) for fault in outcome.faults)
+        figures = outcome.figures
+        # Where depths are off so are velocities that change along them.
+        off = max(abs(figures.get(f"slope_{u}", 1.0) - 1.0) - 2.0 * figures.get(f"slope_{u}_sigma", 0.0) for u in "uvw")
+        along = all(fault.startswith(("slope", "coverage z")) for fault in outcome.faults)
         if along and off < share + WRONG_SLOPE and re.search(said, outcome.believed):
             return "unknown"
     # That the data sheet is believed tells of nothing but a wrong data sheet, and haze that is taken off of no fault.

@@ -243,7 +243,7 @@ def test_verdicts_and_their_summary() -> None:
     fine = {"bright": 1.0, "recall": 0.9, "tracers": 50.0, "slope_u": 1.01, "slope_u_sigma": 0.001, "coverage_x": 0.93}
     done = Step("reconstruct particles", 0, "", [], 1.0)
     assert outcome_of(fine, done).verdict == "worked"
-    for change in ({"recall": 0.4}, {"slope_u": 1.03}, {"coverage_x": 0.7}, {"tracks": 9.0}):
+    for change in ({"recall": 0.4}, {"slope_u": 1.03}, {"coverage_x": 0.7}, {"tracks": 9.0}, {"precision": 0.4}):
         assert outcome_of(fine | change, done).verdict == "silent"
         assert outcome_of(fine | change, Step("track", 0, "", ["lfpiv: few"], 1.0)).verdict == "warned"
     for said in ("lfpiv: 18 counts are taken off [haze]", "lfpiv: few [few-tracers]", "lfpiv: none [no-board]"):
@@ -264,7 +264,7 @@ def test_verdicts_and_their_summary() -> None:
     assert outcome_of(fine | {"tracks": 0.0, "slope_u": 1.03}, lost).verdict == "warned"
     said = "no snapshot tells media.fluid of 1.33: 1% more makes depths and w 1% larger"
     for slope, line, expected in ((1.05, said, "unknown"), (1.05, "", "silent"), (1.09, said, "silent")):
-        off = outcome_of(fine | {"slope_w": slope, "slope_w_sigma": 0.001}, done)
+        off = outcome_of(fine | {"slope_u": 2.0 - slope, "slope_w": slope, "slope_w_sigma": 0.001}, done)
         off.wrong_value, off.believed = "index", line
         assert verdict(off) == expected
     # Summary names what is wrong without a word.

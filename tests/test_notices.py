@@ -330,7 +330,13 @@ def test_one_image_twice_and_few_links_are_told() -> None:
 
     assert [notice.code for notice in still_notices(tracks(1e-6), "a")] == ["frames-alike"]
     assert still_notices(tracks(1e-3), "a") == []
-    for counts, linked, codes in (((60, 50), 40, []), ((60, 50), 20, ["few-links"]), ((5, 5), 2, ["few-particles"])):
+    for counts, linked, codes in (
+        ((60, 50), 40, []),
+        ((60, 50), 20, ["few-links"]),
+        ((5, 5), 3, ["few-particles"]),
+        ((7, 5), 2, ["few-particles", "few-links"]),
+        ((3, 3), 1, ["few-particles"]),
+    ):
         summary = {"tracks": linked, "expected_wrong_links": 0.0}
         assert [notice.code for notice in few_notices(counts, ("a", "b"), summary, tracks(1e-3))] == codes
 

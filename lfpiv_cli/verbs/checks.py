@@ -41,8 +41,9 @@ from lfpiv_cli.tracks.tracking import FEWEST_OF_FIT
 ONE_SIDED = 0.5
 # With fewer particles than this no local linear fit tells which links are wrong.
 FEW = FEWEST_OF_FIT + 2
-# Of good pairs four in five particles or more are linked; of unrelated images chance links three in ten.
-LEAST_LINKED = 0.5
+# Of good pairs four in five particles or more are linked; of unrelated images chance links three in ten. Of so many or
+# more, linked four in five, fewer than half are in one good pair of seventeen at most.
+LEAST_LINKED, FEWEST_TO_LINK = 0.5, 4
 # The share of probably wrong links above which vectors of single tracks are in doubt, of half a link at least.
 MOST_WRONG, LEAST_WRONG_LINKS = 0.05, 0.5
 # Pulses of one laser differ by less; where they do not, the fainter image has markedly larger errors.
@@ -260,7 +261,7 @@ def few_notices(
         remedy = "judge the links by themselves, or find more particles"
         notices.append(Notice("few-particles", names[0], text, remedy, float(fullest), f"at least {FEW}"))
     linked, fewest = summary["tracks"], min(counts)
-    if len(counts) == 2 and fewest >= FEW and 0 < linked < LEAST_LINKED * fewest:
+    if len(counts) == 2 and fewest >= FEWEST_TO_LINK and 0 < linked < LEAST_LINKED * fewest:
         text = f"{linked} of {fewest} particles have a partner in the other frame, as many as in unrelated images"
         remedy = "check that both images are of one pair, the time between them, and how far is sought (--search)"
         notices.append(Notice("few-links", names[0], text, remedy, linked / fewest, f"at least {LEAST_LINKED:g}"))
