@@ -61,8 +61,8 @@ BEFORE_THE_WORK = ("calibrate-snapshot", "build-weights")
 # Standard deviation of a speck's shadow in pixels, and its depth.
 SPECK_PX, SPECK_DEPTH = (0.7, 4.0), (0.1, 0.8)
 # A result is wrong where a slope is off by more (and by more than two of its standard errors), where less than this
-# share of bright tracers is found, where less than this share of what is found are tracers, where fewer errors lie within 1.96 standard errors, of so many at least, and where
-# less than this share of the tracers found is followed into the second image.
+# share of bright tracers is found, or of what is found are tracers, where fewer errors lie within 1.96 standard errors,
+# of so many at least, and where less than this share of the tracers found is followed into the second image.
 SMALLEST_TRACKED, SMALLEST_PRECISION = 0.5, 0.5
 WRONG_SLOPE, SMALLEST_RECALL, SMALLEST_COVERAGE, FEWEST = 0.02, 0.5, 0.8, 20
 # A magnification is wrong that is off by more, and by more than so many of its standard errors.
