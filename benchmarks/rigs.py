@@ -70,8 +70,12 @@ WRONG_MAGNIFICATION, WRONG_SIGMAS = 0.002, 3.0
 # Tracers are bright where at least this share of them could be told from noise alone.
 BRIGHT_SHARE = 0.5
 
-# What no image tells: what `check` says of it, and which figures it makes wrong by how much.
-BELIEVED = {"index": ("media.fluid of [0-9.]+: 1% more makes depths and w 1% larger", WRONG["index"][1])}
+# What no image tells: what `check` says of it, by how much it is off, and which places it makes wrong by more than is
+# stated; velocities are off by no larger a share.
+BELIEVED = {
+    "index": ("media.fluid of [0-9.]+: 1% more makes depths and w 1% larger", WRONG["index"][1], "z"),
+    "focal length": (r"focal_length_mm of [0-9.]+: 1% more moves places .* um across", WRONG["focal length"][1], "xyz"),
+}
 
 # Advice on what a good rig measures or believes, which says nothing against its pictures; it tells of no wrong result.
 ADVICE = {
@@ -341,12 +345,13 @@ def verdict(outcome: Outcome) -> str:
     if "no-tracks" in codes(outcome.steps) and all("tracks of" in fault for fault in outcome.faults):
         return "refused"
     if outcome.wrong_value in BELIEVED:
-        said, share = BELIEVED[outcome.wrong_value]
+        said, share, axes = BELIEVED[outcome.wrong_value]
         figures = outcome.figures
         # Where depths are off so are velocities that change along them.
         off = max(abs(figures.get(f"slope_{u}", 1.0) - 1.0) - 2.0 * figures.get(f"slope_{u}_sigma", 0.0) for u in "uvw")
-        along = all(fault.startswith(("slope", "coverage z")) for fault in outcome.faults)
-        if along and off < share + WRONG_SLOPE and re.search(said, outcome.believed):
+        of_it = ("slope", *(f"coverage {axis}" for axis in axes))
+        by_that = off < share + WRONG_SLOPE and all(fault.startswith(of_it) for fault in outcome.faults)
+        if by_that and re.search(said, outcome.believed):
             return "unknown"
     # That the data sheet is believed tells of nothing but a wrong data sheet, and haze that is taken off of no fault.
     reported = set(codes(outcome.steps)) - ADVICE - {"haze"}

@@ -122,6 +122,12 @@ def test_what_no_snapshot_tells_is_said_with_how_far_off_results_are(index: floa
     assert ("media.fluid of 1.33: 1% more makes depths and w 1% larger" in line.reason) == named
     # At -1 a depth is n p N / M^2, N growing with 1 - M.
     assert "magnification of -1: 1% more makes lengths 1.0% and depths 1.5% smaller" in line.reason
+    # What rays through the middle of the lens do between the focal plane and the volume's end.
+    side, depth = np.abs(bench.bounds_mm[:2]).max(), np.abs(bench.bounds_mm[2]).max()
+    moved = float(re.search(r"corners by ([\d.]+) um", line.reason)[1])
+    other = replace(bench.camera, focal_length_mm=1.01 * bench.camera.focal_length_mm).focus_distance_mm
+    seen = side * depth * bench.media.depth_ratio * (1.0 / bench.camera.focus_distance_mm - 1.0 / other)
+    assert moved == pytest.approx(1e3 * seen, rel=0.06)
     deeper = bench.camera.scale(replace(bench.media, fluid=1.01 * index)).depth_mm
     assert deeper == pytest.approx(1.01 * bench.scale.depth_mm, rel=1e-12)
 

@@ -441,7 +441,14 @@ def believed_line(bench: Bench) -> Line:
         reasons[0] += f" of {camera.magnification:g}: 1% more makes lengths {across:.1%} and depths {along:.1%} smaller"
     if index != 1.0:
         reasons.append(f"no snapshot tells media.fluid of {index:g}: 1% more makes depths and w 1% larger")
-    reasons += ["boards at several depths tell"] if reasons else []
+    # Rays through the middle of the lens meet a depth z, as seen in air, by x z / s_o beside where they meet the focus.
+    corner = np.abs(bench.bounds_mm).max(axis=1)
+    moved_mm = 0.01 * corner[:2].max() * corner[2] * bench.media.depth_ratio / camera.focus_distance_mm
+    reasons.append(
+        f"no snapshot tells camera.main_lens.focal_length_mm of {camera.focal_length_mm:g}: 1% more moves places at "
+        f"the volume's corners by {written(moved_mm / UM_TO_MM, 2)} um across"
+    )
+    reasons.append("boards at several depths tell these")
     reasons.append("nothing tells which image of a pair is the first: exchanged, velocities change their sign")
     return Line("believed", "unknown", "; ".join(reasons))
 
