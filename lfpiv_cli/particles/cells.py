@@ -29,7 +29,8 @@ from lfpiv_cli.weights.lens_cells import neighbours
 
 # The rim is straight across a patch but for its sagitta, taken as its mean: the share is right to 6e-3 where the rim
 # enters a patch by its corner, to 1e-3 on average. An edge that runs along a patch's side is taken to lean by so much.
-LEAST_LEAN = 1e-3
+# Less than the least share is none, by no rounding some.
+LEAST_LEAN, LEAST_SHARE = 1e-3, 1e-9
 # Of lengths that divide, mm.
 TINY = 1e-12
 
@@ -53,6 +54,7 @@ def covered_share(x: float, y: float, width: float, radius: float) -> tuple[floa
     p2, q2, r2, s2 = 0.5 * p * p, 0.5 * q * q, 0.5 * r * r, 0.5 * s * s
     per = 0.25 / (a * b)
     per_a, per_b = 4.0 * b * per, 4.0 * a * per
+    per = per if per * (p2 - q2 - r2 + s2) > LEAST_SHARE else 0.0
     share, dense = per * (p2 - q2 - r2 + s2), per * (p - q - r + s)
     third = (p * p2 - q * q2 - r * r2 + s * s2) / 3.0
     mean_x = per * (per_a * third - (p2 - q2 + r2 - s2))
