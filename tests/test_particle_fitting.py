@@ -118,7 +118,8 @@ def test_a_pixel_between_micro_images_counts_once(view: View, rng: np.random.Gen
     count = respond_once(view, *particle[0, :3], pixels, values)
     assert np.unique(pixels[:count]).size == count
     rows, picked = np.ascontiguousarray(values[:count].T), np.empty((2, count))
-    change = normal_equations(pixels[:count], rows, 5e5, residual, weight, picked, np.empty((4, 4)), np.empty(4))
+    observation = observed(view, residual, weight)
+    change = normal_equations(pixels[:count], rows, 5e5, observation, picked, np.empty((4, 4)), np.empty(4))
     direct = np.sum(weight * ((residual - image_of(view, particle)) ** 2 - residual**2))
     assert change == pytest.approx(direct, rel=1e-9)
 

@@ -189,14 +189,27 @@ class Refitted(NamedTuple):
     gain: Floats
 
 
+class Elsewhere(NamedTuple):
+    """Where else fits of particles begin.
+
+    Attributes
+    ----------
+    depths_mm : (n, k) on each one's line of sight, NaN for nowhere
+    choice : among these
+    gain : what another depth must gain in chi-squared
+    """
+
+    depths_mm: Floats
+    choice: Choice
+    gain: float
+
+
 def fit_again(
     observation: Observation,
     particles: Floats,
     chosen: NDArray[np.bool_],
     effort: Effort,
-    depths_mm: Floats | None = None,
-    choice: Choice = NOWHERE_ELSE,
-    gain: float = 0.0,
+    elsewhere: Elsewhere | None = None,
     prior: Floats | None = None,
 ) -> Refitted:
     """Fit the chosen ones of particles (n, 4) in place, from where they are and from other depths.
@@ -205,17 +218,15 @@ def fit_again(
 
     Parameters
     ----------
-    depths_mm : (n, k) where else to begin, NaN for nowhere; default: nowhere
-    choice : among these
-    gain : what another depth must gain in chi-squared
+    elsewhere : where else to begin; default: nowhere
     prior : (n, 8) what is expected of the particles; default: nothing
     """
     expected = nothing_expected(len(particles)) if prior is None else prior
-    depths = np.empty((len(particles), 0)) if depths_mm is None else depths_mm
+    others = Elsewhere(np.empty((len(particles), 0)), NOWHERE_ELSE, 0.0) if elsewhere is None else elsewhere
     refitted = Refitted(np.zeros(len(particles), np.bool_), np.zeros(len(particles)))
 
     def work(numbers: NDArray[np.int64]) -> None:
-        _fit_again(observation, particles, expected, numbers[chosen[numbers]], effort, depths, (choice, gain), refitted)
+        _fit_again(observation, particles, expected, numbers[chosen[numbers]], effort, others, refitted)
 
     over_tiles(work, observation.optics, particles, observation.depths_mm)
     return refitted
@@ -228,12 +239,11 @@ def _fit_again(
     prior: Floats,
     numbers: NDArray[np.int64],
     effort: Effort,
-    depths: Floats,
-    elsewhere: tuple[Choice, float],
+    elsewhere: Elsewhere,
     refitted: Refitted,
 ) -> None:
     """Do the work of `fit_again` for the particles of a tile."""
-    view, residual = observation.optics, observation.residual
+    view, residual, depths = observation.optics, observation.residual, elsewhere.depths_mm
     responses = room_for(1, observation.capacity, 0)
     starts, best = np.empty((depths.shape[1], 1, UNKNOWNS)), np.empty((1, UNKNOWNS))
     for number in numbers:
@@ -245,9 +255,9 @@ def _fit_again(
         before = change_by(pixels, values, best[0, 3], residual, observation.weight) + prior_chi2(best, expected)
         after = fit(observation, best, expected, responses, effort)
         if depths.shape[1] > 0:
-            lowest = after - elsewhere[1]
+            lowest = after - elsewhere.gain
             begin_at(view, particles[number], depths[number], starts)
-            change = fit_best(observation, starts, expected, responses, elsewhere[0], (np.inf, lowest), best)
+            change = fit_best(observation, starts, expected, responses, elsewhere.choice, (np.inf, lowest), best)
             if change < lowest:
                 after = change
                 refitted.moved[number] = True

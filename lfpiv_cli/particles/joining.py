@@ -198,12 +198,12 @@ def join(
     light = particles[pairs, 3:]
     middle = np.sum(particles[pairs] * light, axis=1) / np.maximum(light.sum(axis=1), np.finfo(np.float64).tiny)
     # Starts lie in the middle: from there fits move no further than tiles allow.
-    over_tiles(
-        lambda numbers: _join(observation, particles, middle, pairs, numbers, largest_loss, brightest, joined, free),
-        observation.optics,
-        middle,
-        observation.depths_mm,
-    )
+    limits = np.column_stack([largest_loss, brightest])
+
+    def work(numbers: NDArray[np.int64]) -> None:
+        joined[numbers] = _join(observation, particles, middle, pairs, numbers, limits, free)
+
+    over_tiles(work, observation.optics, middle, observation.depths_mm)
     return joined
 
 
@@ -214,17 +214,18 @@ def _join(
     middle: Floats,
     pairs: NDArray[np.int64],
     numbers: NDArray[np.int64],
-    largest_loss: Floats,
-    brightest: Floats,
-    joined: NDArray[np.bool_],
+    limits: Floats,
     free: NDArray[np.bool_],
-) -> None:
-    """Do the work of `join` for the pairs of a tile; `free` are particles that no pair has taken yet."""
+) -> NDArray[np.bool_]:
+    """Do the work of `join` for the pairs of a tile, and return which are joined.
+
+    `limits` (m, 2) are the largest loss and the most light, `free` particles that no pair has taken yet.
+    """
     view, residual, weight = observation.optics, observation.residual, observation.weight
     responses, prior = room_for(1, observation.capacity, 0), np.zeros((1, 2 * UNKNOWNS))
     depths, starts, best = np.empty(3), np.empty((3, 1, UNKNOWNS)), np.empty((1, UNKNOWNS))
-    effort = Effort(STEPS, CHOICE_GAIN)
-    for number in numbers:
+    effort, joined = Effort(STEPS, CHOICE_GAIN), np.zeros(numbers.size, np.bool_)
+    for k, number in enumerate(numbers):
         first, second = pairs[number]
         if not (free[first] and free[second]):
             continue
@@ -236,14 +237,15 @@ def _join(
             two += change_by(pixels, values, particles[member, 3], residual, weight)
         depths[0], depths[1], depths[2] = middle[number, 2], particles[first, 2], particles[second, 2]
         begin_at(view, middle[number], depths, starts)
-        choice = Choice(effort, NO_FURTHER, len(starts), LEAST_LIGHT, brightest[number])
-        limits = np.inf, two + largest_loss[number]
-        joined[number] = fit_best(observation, starts, prior, responses, choice, limits, best) < limits[1]
-        if joined[number]:
+        choice = Choice(effort, NO_FURTHER, len(starts), LEAST_LIGHT, limits[number, 1])
+        highest = two + limits[number, 0]
+        joined[k] = fit_best(observation, starts, prior, responses, choice, (np.inf, highest), best) < highest
+        if joined[k]:
             copy_rows(best, particles[first : first + 1])
             free[first] = free[second] = False
         for member in (first, second):
-            if member == first or not joined[number]:
+            if member == first or not joined[k]:
                 observation.respond(view, particles[member : member + 1], responses)
                 pixels, values = lit_by(responses, 0)
                 add_light(pixels, values, -particles[member, 3], residual)
+    return joined

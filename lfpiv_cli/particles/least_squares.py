@@ -145,8 +145,7 @@ def normal_equations(
     pixels: NDArray[np.int32],
     values: Floats,
     light: float,
-    residual: Floats,
-    weight: Floats,
+    observation: Observation,
     picked: Floats,
     matrix: Floats,
     right: Floats,
@@ -155,8 +154,8 @@ def normal_equations(
 
     `picked` (2, n or more) is room.
     """
-    pick(pixels, residual, picked[0])
-    pick(pixels, weight, picked[1])
+    pick(pixels, observation.residual, picked[0])
+    pick(pixels, observation.weight, picked[1])
     change = 0.0
     # Kept out of arrays, sums stay in registers.
     r0 = r1 = r2 = r3 = 0.0
@@ -213,10 +212,10 @@ def _pair_equations(
     pixels_1, values_1 = lit_by(responses, 0)
     pixels_2, values_2 = lit_by(responses, 1)
     picked = responses.picked
-    change = normal_equations(pixels_1, values_1, pair[0, 3], residual, weight, picked, block, right[:UNKNOWNS])
+    change = normal_equations(pixels_1, values_1, pair[0, 3], observation, picked, block, right[:UNKNOWNS])
     copy_rows(block, matrix[:UNKNOWNS, :UNKNOWNS])
     add_light(pixels_1, values_1, -pair[0, 3], residual)
-    change += normal_equations(pixels_2, values_2, pair[1, 3], residual, weight, picked, block, right[UNKNOWNS:])
+    change += normal_equations(pixels_2, values_2, pair[1, 3], observation, picked, block, right[UNKNOWNS:])
     copy_rows(block, matrix[UNKNOWNS:, UNKNOWNS:])
     add_light(pixels_1, values_1, pair[0, 3], residual)
     # What the first explains is off the second's side already; the first's side still lacks the second's light.
@@ -343,9 +342,7 @@ def _equations(
         change = _pair_equations(observation, members, responses, matrix, right)
     else:
         pixels, values = lit_by(responses, 0)
-        change = normal_equations(
-            pixels, values, members[0, 3], observation.residual, observation.weight, responses.picked, matrix, right
-        )
+        change = normal_equations(pixels, values, members[0, 3], observation, responses.picked, matrix, right)
     for m in range(members.shape[0]):
         for i in range(UNKNOWNS):
             expected, weight, row = prior[m, i], prior[m, UNKNOWNS + i], m * UNKNOWNS + i

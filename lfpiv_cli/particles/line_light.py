@@ -105,7 +105,7 @@ def respond_by_lines(view: View, bend: Bend, z: float, pixels: NDArray[np.int32]
             of_y = _cell(view, (before, s_y, behind), y.pixels, centres[j, middle_i, 1] - s_y)
             if of_x.number > 0 and of_y.number > 0 and count + of_x.number * of_y.number <= pixels.size:
                 responses = of_columns[i - low_i], of_rows[j - low_j]
-                count += _write_lens(view, projection, of_x, of_y, responses, room, pixels[count:], values[:, count:])
+                count += _write_lens(view, projection, (of_x, of_y), responses, room, pixels[count:], values[:, count:])
     return count
 
 
@@ -249,8 +249,7 @@ def _multiply(room: Room, size: tuple[int, int], kinds: tuple[int, int], value: 
 def _write_lens(
     view: View,
     projection: Projection,
-    of_x: Cell,
-    of_y: Cell,
+    cells: tuple[Cell, Cell],
     responses: tuple[Lines, Lines],
     room: Room,
     pixels: NDArray[np.int32],
@@ -258,6 +257,7 @@ def _write_lens(
 ) -> int:
     """Write the entries of one lens from its responses along both axes; return their number."""
     x, y, (columns, rows), length = projection.x, projection.y, responses, room.length
+    of_x, of_y = cells
     size, dark = (of_x.number, of_y.number), np.float32(DARK)
     _place(columns, LIGHT, of_x, view.lines.ones, room.across, length)
     _place(rows, LIGHT, of_y, view.lines.signs, room.down, length)

@@ -89,15 +89,14 @@ def project(view: View, bend: Bend) -> Projection:
     camera = view.camera
     x, y = bend.seen_x, bend.seen_y
     beta_x, beta_y = camera.image_distance_mm / bend.distance_x, camera.image_distance_mm / bend.distance_y
-    x0, y0 = -beta_x * x, -beta_y * y
-    r2 = x0 * x0 + y0 * y0
+    r2 = (beta_x * x) ** 2 + (beta_y * y) ** 2
     # Curved faces show a ball wider, by how its points move along an axis with their places, depths among them.
     wide = tall = 1.0
     if bend.line_moves.shape[0] > 0:
         wide, tall = _length(bend.line_moves[0, 0]), _length(bend.line_moves[1, 0])
     return Projection(
-        _along(view, x, beta_x, bend.distance_x, x0, r2, wide, (view.half_x_mm, camera.columns)),
-        _along(view, y, beta_y, bend.distance_y, y0, r2, tall, (view.half_y_mm, camera.rows)),
+        _along(view, x, beta_x, bend.distance_x, r2, wide, (view.half_x_mm, camera.columns)),
+        _along(view, y, beta_y, bend.distance_y, r2, tall, (view.half_y_mm, camera.rows)),
     )
 
 
@@ -109,10 +108,10 @@ def _length(vector: Floats) -> float:
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
 def _along(
-    view: View, x: float, beta: float, distance: float, x0: float, r2: float, wide: float, cell: tuple[float, int]
+    view: View, x: float, beta: float, distance: float, r2: float, wide: float, cell: tuple[float, int]
 ) -> Along:
-    """Return `Along` of a particle that would be seen at x0 of r without distortion, its ball so many times as wide."""
-    camera = view.camera
+    """Return `Along` of a particle that would be seen at r without distortion, its ball so many times as wide."""
+    camera, x0 = view.camera, -beta * x
     alpha = 1.0 + beta - camera.image_distance_mm / camera.focal_length_mm
     tilt = camera.microlens_distance_mm / camera.image_distance_mm
     scale, lever = camera.bend * alpha + tilt * (alpha - 1.0), camera.bend + tilt

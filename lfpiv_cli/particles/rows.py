@@ -58,6 +58,14 @@ class Scratch(NamedTuple):
     lenses: NDArray[np.int64]
 
 
+class Entries(NamedTuple):
+    """What is written, see `respond_rows`, and the room to work it out."""
+
+    pixels: NDArray[np.int32]
+    values: Floats
+    room: Scratch
+
+
 @njit(cache=True)
 def scratch(capacity: int) -> Scratch:
     """Return the room for so many entries."""
@@ -77,7 +85,7 @@ def respond_rows(view: View, bend: Bend, pixels: NDArray[np.int32], values: Floa
     """
     if not is_seen(bend):
         return 0
-    projection = project(view, bend)
+    projection, entries = project(view, bend), Entries(pixels, values, room)
     if bend.cubic.shape[0] > 0:
         _set_curved_numbers(view, projection, bend, room.numbers)
     else:
@@ -95,7 +103,7 @@ def respond_rows(view: View, bend: Bend, pixels: NDArray[np.int32], values: Floa
                 count = join_cell(view, projection, bend, lens, pixels[begin:], values.T[begin:])
                 _set_rectangle(pixels[begin : begin + count], view.camera.columns, ends[shown + 1])
             else:
-                count = _write_lens(view, projection, bend, lens, begin, pixels, values, room, ends[shown + 1])
+                count = _write_lens(view, projection, bend, lens, begin, entries, ends[shown + 1])
             if count == 0:
                 continue
             shown += 1
@@ -162,16 +170,15 @@ def _write_lens(
     bend: Bend,
     lens: tuple[float, float],
     begin: int,
-    pixels: NDArray[np.int32],
-    values: Floats,
-    room: Scratch,
+    entries: Entries,
     rectangle: NDArray[np.int64],
 ) -> int:
     """Write the entries of one lens with a rectangular cell from `begin` on; return their number.
 
     Sets the rectangle of pixels that they lie in: first and last row, first and last column, from the second number on.
     """
-    camera, numbers, x, y = view.camera, room.numbers, projection.x, projection.y
+    camera, room, x, y = view.camera, entries.room, projection.x, projection.y
+    numbers = room.numbers
     bent = bent_at(view, projection, bend, lens[0], lens[1])
     gain_x, gain_y = x.stretch * x.alpha + bent.gain_x, y.stretch * y.alpha + bent.gain_y
     offset_x, offset_y = x.at + bent.x - lens[0], y.at + bent.y - lens[1]
@@ -204,7 +211,7 @@ def _write_lens(
     # How far from a patch the edge of the ball is seen from, at most.
     away = np.hypot(x.lever * x.beta * x.ball / x.scale, y.lever * y.beta * y.ball / y.scale)
     patches = step_x, width, away
-    return _write_rows(view, (bend.cubic, rises), lit, patches, begin, pixels, values, room, rectangle)
+    return _write_rows(view, (bend.cubic, rises), lit, patches, begin, entries, rectangle)
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
@@ -263,9 +270,7 @@ def _write_rows(
     lit: tuple[tuple[int, int], tuple[int, int]],
     patches: tuple[float, float, float],
     begin: int,
-    pixels: NDArray[np.int32],
-    values: Floats,
-    room: Scratch,
+    entries: Entries,
     rectangle: NDArray[np.int64],
 ) -> int:
     """Write the entries of one lens whose profiles are known, row by row; see `_write_lens`.
@@ -276,7 +281,7 @@ def _write_rows(
     lit : first row and their number, first column and their number
     patches : the step along x from one to the next, their mean width, and how far from them a ball is seen from at most
     """
-    camera = view.camera
+    camera, (pixels, values, room) = view.camera, entries
     (row, rows), (column, columns) = lit
     cubic, tangent = bent
     step, width, away = patches

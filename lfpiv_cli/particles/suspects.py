@@ -14,7 +14,7 @@ from scipy.spatial import KDTree
 
 from lfpiv_cli.arrays import Floats
 from lfpiv_cli.grid import Scale
-from lfpiv_cli.particles.fitting import NO_FURTHER, Choice, fit_again, fit_best
+from lfpiv_cli.particles.fitting import NO_FURTHER, Choice, Elsewhere, fit_again, fit_best
 from lfpiv_cli.particles.least_squares import (
     CHOICE_GAIN,
     UNKNOWNS,
@@ -156,7 +156,8 @@ def try_other_depths(
     starts[(starts < observation.low_mm) | (starts > observation.high_mm)] = np.nan
     effort = Effort(STEPS, CHOICE_GAIN)
     choice = Choice(effort, NO_FURTHER, FINALISTS, smallest_light, np.inf)
-    return fit_again(observation, particles, suspects, effort, starts, choice, smallest_gain, prior).moved
+    elsewhere = Elsewhere(starts, choice, smallest_gain)
+    return fit_again(observation, particles, suspects, effort, elsewhere, prior).moved
 
 
 # Particles that fit worse than good ones by this factor are suspects.
