@@ -45,7 +45,7 @@ def covered_share(x: float, y: float, width: float, radius: float) -> tuple[floa
     give the means.
     """
     half = 0.5 * width
-    away = np.sqrt(x * x + y * y) + TINY
+    away = max(np.sqrt(x * x + y * y), TINY)
     to_x, to_y = abs(x) / away, abs(y) / away
     a, b = half * max(to_x, LEAST_LEAN), half * max(to_y, LEAST_LEAN)
     t = min(max(radius - away - half * half / (6.0 * radius), -(a + b)), a + b)
