@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numba import typeof, types
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
@@ -104,6 +105,11 @@ def test_image_and_what_is_expected_count_by_their_errors(view: View, rng: np.ra
     error = np.sqrt(np.diagonal(np.linalg.inv(inverse)))
     assert np.all(np.abs(both - by_image)[:3] > 0.3 * error[:3])
     np.testing.assert_allclose((fitted(prior) - both) / error, 0.0, atol=0.02)
+
+
+def test_the_type_of_an_observation_is_numbas_own(view: View) -> None:
+    observation = observed(view, np.zeros(12), np.ones(12))
+    assert typeof(observation) == types.NamedTuple([typeof(each) for each in observation], Observation)
 
 
 @pytest.mark.thorough

@@ -191,7 +191,7 @@ class Batch(Generic[Made]):
         raise NotImplementedError
 
     def summary(self, worked: Worked[Made]) -> dict[str, Any]:
-        """Return what is told of what became of it."""
+        """Return what is reported of what became of it."""
         return {}
 
 
@@ -235,7 +235,7 @@ class Worked(Generic[Made]):
 
 
 def carried_out(batch: Batch[Made], options: BatchOptions, console: Console) -> dict[str, Any]:
-    """Make what there is to make of a batch, or tell what that would be; return what is told of it.
+    """Make what there is to make of a batch, or say what that would be; return what is reported of it.
 
     Raises
     ------
