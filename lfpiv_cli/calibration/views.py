@@ -32,7 +32,9 @@ def board_corners(picture: NDArray[np.uint8], board: BoardGeometry) -> tuple[Int
     All those of a chessboard, None where it is not wholly there; those of a ChArUco board that are seen, None where
     none is.
     """
-    every, (across, down) = board_numbers(board), board.dots
+    across, down = board.dots
+    # Their numbers (n, 2) along the columns and rows, row by row.
+    every = np.stack(np.meshgrid(np.arange(across), np.arange(down)), axis=-1).reshape(-1, 2).astype(np.int64)
     if board.pattern == "chessboard":
         # CALIB_CB_NORMALIZE_IMAGE would equalise the histogram, which draws corners of small boards off by a square
         flags = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY
@@ -73,11 +75,6 @@ def alternating(picture: NDArray[np.uint8], corners: Floats) -> bool:
     even = ((across + down) % 2 == 0).ravel()[inside]
     apart = max(level[even].min() - level[~even].max(), level[~even].min() - level[even].max())
     return bool(apart > LEAST_CONTRAST)
-
-
-def board_numbers(board: BoardGeometry) -> Integers:
-    """Return the numbers (n, 2) of all corners along the board's columns and rows, row by row."""
-    return np.stack(np.meshgrid(*(np.arange(n) for n in board.dots)), axis=-1).reshape(-1, 2).astype(np.int64)
 
 
 def charuco_board(board: BoardGeometry) -> cv2.aruco.CharucoBoard:

@@ -244,12 +244,6 @@ class Points(ArrayResult):
 PointRows: TypeAlias = Points | StoredTracks
 
 
-def no_points(format_name: str, reference: Reference) -> Points:
-    """Return points of a format of which there are none."""
-    arrays = {name: np.zeros((0, 6) if name.startswith("covariance") else 0) for name in UNITS[format_name]}
-    return Points(np.zeros((0, 3)), arrays, reference, {}, {})
-
-
 def write_points(path: Path, format_name: str, points: PointRows, *, overwrite: bool) -> None:
     """Write points; their arrays are all that the format needs or may have, each with a row for each point."""
     units = UNITS[format_name]

@@ -272,7 +272,8 @@ def walls_figure(refinement: Refinement) -> style.Figure:
     Needs matplotlib.
     """
     walls = refinement.walls
-    depth = walls.depth_from_middle(refinement.position_mm)
+    place = refinement.position_mm
+    depth = place[:, 2] - place[:, :2] @ walls.slope - walls.middle_mm
     half = 0.5 * walls.width_mm
     searched = refinement.depths_mm[1] - refinement.depths_mm[0]
     figure, ((whole, across), (near, far)) = style.new_panels(12.0, 8.0, 2, 2)

@@ -110,10 +110,6 @@ class Walls:
     blur_mm: float
     stray_share: float
 
-    def depth_from_middle(self, position_mm: Floats) -> Floats:
-        """Return how far (n,) behind the mid plane positions (n, 3) lie."""
-        return np.asarray(position_mm[:, 2] - position_mm[:, :2] @ self.slope - self.middle_mm, dtype=np.float64)
-
     def density(self, depth_mm: Floats, searched_mm: float) -> Floats:
         """Return the share of the particles per mm at depths (n,) behind the mid plane."""
         parameters = np.array([0.0, 0.5 * self.width_mm, 0.0, 0.0, self.linear, self.quadratic])

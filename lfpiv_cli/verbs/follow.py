@@ -15,13 +15,15 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from lfpiv_cli.console import CONSOLE, Console, Frames
 from lfpiv_cli.errors import InputError, UsageError
 from lfpiv_cli.files import atomic, export_vtk, pairing, shares
 from lfpiv_cli.files import images as image_files
 from lfpiv_cli.files.batch import VTKHDF_SUFFIX, Frame, Target, frames_of, images_seen, output_paths, pending
 from lfpiv_cli.files.config import Config, carried_config
-from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, Points, no_points, read_points, write_points
+from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, UNITS, Points, read_points, write_points
 from lfpiv_cli.files.provenance import even_step_s, record, sha256, with_warnings
 from lfpiv_cli.files.weights_file import WeightsFile
 from lfpiv_cli.grid import Reference
@@ -119,7 +121,9 @@ class Way(Batch[None]):
         """Return the particles of a frame; none of one that was left out."""
         path = self.targets[number].path
         if number not in self.order or number in self.failed:
-            return no_points(PARTICLES_FORMAT, self.reference)
+            shapes = {name: (0, 6) if name.startswith("covariance") else 0 for name in UNITS[PARTICLES_FORMAT]}
+            none = {name: np.zeros(shape) for name, shape in shapes.items()}
+            return Points(np.zeros((0, 3)), none, self.reference, {}, {})
         if not path.exists():
             with shares.awaited(path):  # another worker makes it now
                 pass

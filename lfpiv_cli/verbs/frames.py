@@ -170,19 +170,6 @@ def readable(read: Callable[[int], Found], numbers: Iterable[int], keep_going: b
         yield image
 
 
-def mask_of(
-    mask: str | Path | None, frames: Sequence[Frame], shape: tuple[int, int], pitch_px: float, keep_going: bool = False
-) -> Image | None:
-    """Return the mask, 0 where pixels are left out: of a file, or of what does not move in the frames (`still`)."""
-    if mask is None:
-        return None
-    if mask != STILL:
-        return image_files.read_reference(Path(mask), shape)
-    images = readable(lambda number: read_frame(frames[number], shape), range(len(frames)), keep_going)
-    still = of_images.still_light(images, pitch_px)
-    return np.where(still, np.float32(0.0), np.float32(1.0))
-
-
 class ReadAhead:
     """Frames, each read while the one before is worked on."""
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from lfpiv_cli.arrays import Floats, root_of_squares
 from lfpiv_cli.errors import ConfigError, InputError
+from lfpiv_cli.files import images as image_files
 from lfpiv_cli.files.batch import Frame as ImageFrame
 from lfpiv_cli.files.config import Config, carried_config
 from lfpiv_cli.files.hdf5 import unpacked_bytes
@@ -32,11 +33,12 @@ from lfpiv_cli.particles.neighbour_frames import second_frame, second_pass
 from lfpiv_cli.particles.rounds import ROUNDS, first_pass
 from lfpiv_cli.particles.search import LAST_UNEXPLAINED, MARGIN_DEPTHS, MUCH_LEFT, Particles, Task, result, task_of
 from lfpiv_cli.particles.view import Light, View, ensure_square_cells, raw_view
+from lfpiv_cli.reconstruction import images as of_images
 from lfpiv_cli.reconstruction.haze import Haze
 from lfpiv_cli.reconstruction.images import Image, Mask, filled, light
 from lfpiv_cli.reconstruction.solvers import Normalisers
 from lfpiv_cli.verbs import frames as of_frames
-from lfpiv_cli.verbs.frames import IMAGE, Bench, Progress, Read, check_frame
+from lfpiv_cli.verbs.frames import IMAGE, STILL, Bench, Progress, Read, check_frame, read_frame, readable
 from lfpiv_cli.verbs.tracers import Diffusion, TracerSize, light_notices, size_notices
 from lfpiv_cli.weights.build import factorise_bricks
 from lfpiv_cli.weights.columns import OnDemandOperator
@@ -507,6 +509,14 @@ class Prepared:
         """Return what frames share, and what reads one; with `keep_going` some may be unreadable."""
         shape, dark = content.image_shape, options.dark_image(content.image_shape)
         pitch_px = float(content.camera.micro_image_lattice_px().pitch.max())
-        mask = of_frames.mask_of(options.mask, frames, shape, pitch_px, keep_going)
+        # What is 0 is left out: as a file has it, or what does not move in the frames (`still`).
+        if options.mask is None:
+            mask = None
+        elif options.mask != STILL:
+            mask = image_files.read_reference(Path(options.mask), shape)
+        else:
+            images = readable(lambda number: read_frame(frames[number], shape), range(len(frames)), keep_going)
+            still = of_images.still_light(images, pitch_px)
+            mask = np.where(still, np.float32(0.0), np.float32(1.0))
         bench = self.bench(content, settings, dark, mask)
         return bench, of_frames.reader(options.level, frames, shape, dark, keep_going)

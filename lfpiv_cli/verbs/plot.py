@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lfpiv_cli.calibration.model import Calibration
 from lfpiv_cli.console import CONSOLE, Console
 from lfpiv_cli.errors import ConfigError, InputError, UsageError
 from lfpiv_cli.files import atomic, calibration_file, hdf5, images, inputs, pages, particle_file, vtkhdf, weights_file
@@ -84,28 +83,16 @@ def of_vectors(
     figures["displacements"] = partial(vectors.displacements_figure, field, _lens_mm(field.provenance))
     if field.dt_s is not None:
         figures["gradients"] = partial(vectors.gradients_figure, field)
-    return figures | _of_statistics(field, arrays, tables, said)
-
-
-def _of_statistics(
-    field: VectorField,
-    arrays: Mapping[str, NDArray[Any]],
-    tables: Mapping[str, Mapping[str, NDArray[Any]]],
-    said: Mapping[str, Any],
-) -> Figures:
-    """Return the figures of statistics over many pairs, where vectors are their mean."""
-    if "convergence" not in tables:
-        return {}
-    figures: Figures = {
-        "moments": partial(of_statistics.moments_figure, field.grid, field.velocity, arrays),
-        "stresses": partial(of_statistics.stresses_figure, field.grid, arrays),
-    }
-    if "profile" in tables:
-        names = said["profile_components"].split(", ")
-        figures["profile"] = partial(of_statistics.profile_figure, said["profile"], names, tables["profile"])
-    pairs, *spreads = (tables["convergence"][name] for name in ("pairs", "velocity_spread", "reynolds_stress_spread"))
-    if all((spread > 0.0).any() for spread in spreads):  # one pair tells none
-        figures["convergence"] = partial(of_statistics.convergence_figure, pairs, *spreads)
+    if "convergence" in tables:  # of many pairs, whose mean these are
+        figures["moments"] = partial(of_statistics.moments_figure, field.grid, field.velocity, arrays)
+        figures["stresses"] = partial(of_statistics.stresses_figure, field.grid, arrays)
+        if "profile" in tables:
+            names = said["profile_components"].split(", ")
+            figures["profile"] = partial(of_statistics.profile_figure, said["profile"], names, tables["profile"])
+        spreads = [tables["convergence"][f"{name}_spread"] for name in ("velocity", "reynolds_stress")]
+        if all((spread > 0.0).any() for spread in spreads):  # one pair tells none
+            pairs = tables["convergence"]["pairs"]
+            figures["convergence"] = partial(of_statistics.convergence_figure, pairs, *spreads)
     return figures
 
 
@@ -193,14 +180,9 @@ def of_volume(volume: vtkhdf.Volume) -> Figures:
     }
 
 
-def of_calibration(calibration: Calibration) -> Figures:
-    """Return the figures of a calibration."""
-    return {"summary": partial(pictures.summary_figure, calibration)}
-
-
 def _of_calibration_in(path: Path, white: Path | None) -> Figures:
     calibration = calibration_file.open_calibration(path)
-    figures = of_calibration(calibration)
+    figures: Figures = {"summary": partial(pictures.summary_figure, calibration)}
     if white is not None:
         image = images.read_single(white, calibration.image_shape)
         figures["lattice"] = partial(pictures.calibration_figure, calibration, image)

@@ -401,7 +401,15 @@ def _chain(contents: Contents, fields: Fields, drawer: Drawer) -> Iterable[Secti
             pictures = drawer.pictures(paths[0], role, only)
             yield Section(title, kind, text, tables=(table,), pictures=tuple(pictures))
     for path in contents.of("calibration")[:1]:
-        table = Table("What the white image and the board show", ("figure", "value"), _with_sigmas(path))
+        summary = {name: value for name, value in open_calibration(path).summary().items() if value is not None}
+        rows = []
+        for name, value in summary.items():
+            base = name.removesuffix("_sigma")
+            if base == name or base not in summary:
+                sigma = summary.get(f"{name}_sigma")
+                each = zip(np.atleast_1d(value), np.atleast_1d(sigma), strict=True) if sigma is not None else ()
+                rows.append((name, ", ".join(with_error(*one) for one in each) or _cell(value)))
+        table = Table("What the white image and the board show", ("figure", "value"), tuple(rows))
         # That `calibrate-snapshot --picture` has put beside it shows all.
         beside = path.with_suffix(".png")
         found = [Picture(beside, "Lens images and board, as found")] if beside.is_file() else []
@@ -409,19 +417,6 @@ def _chain(contents: Contents, fields: Fields, drawer: Drawer) -> Iterable[Secti
         yield Section("Calibration", "calibration", tables=(table,), pictures=tuple(pictures))
     for path in contents.of("weights")[:1]:
         yield Section("Weights", "weights", pictures=tuple(drawer.pictures(path, only=OF_WEIGHTS)))
-
-
-def _with_sigmas(calibration: Path) -> tuple[tuple[str, str], ...]:
-    """Return the figures of a calibration that are known, each with its standard error."""
-    summary = {name: value for name, value in open_calibration(calibration).summary().items() if value is not None}
-    rows = []
-    for name, value in summary.items():
-        base = name.removesuffix("_sigma")
-        if base == name or base not in summary:
-            sigma = summary.get(f"{name}_sigma")
-            each = zip(np.atleast_1d(value), np.atleast_1d(sigma), strict=True) if sigma is not None else ()
-            rows.append((name, ", ".join(with_error(*one) for one in each) or _cell(value)))
-    return tuple(rows)
 
 
 def _sigma(field: VectorField) -> float:
