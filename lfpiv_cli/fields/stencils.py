@@ -255,16 +255,6 @@ def _pattern(components: int, ny: int, nz: int) -> tuple[Integers, Integers, Fla
     return rows[inside], columns[inside], inside
 
 
-def plane_block(matrix: Stencil, row: int, column: int) -> Floats:
-    """Return the dense block of the rows of one plane of x and the columns of another, at most three planes off."""
-    _, components, ny, nz, *_ = matrix.shape
-    rows, columns, inside = _pattern(components, ny, nz)
-    size = components * ny * nz
-    block = np.zeros((size, size))
-    block[rows, columns] = matrix[row, :, :, :, column - row + DEGREE][inside]
-    return block
-
-
 def dense(matrix: Stencil) -> Floats:
     """Return the whole matrix; for small ones."""
     planes = range(matrix.shape[0])
@@ -407,10 +397,13 @@ def factorised(matrix: Stencil) -> Factor:
 
 def _block(matrix: Stencil, rows: range, columns: range) -> Block:
     """Return the dense block of some planes' rows and others' columns."""
-    size = matrix.shape[1] * matrix.shape[2] * matrix.shape[3]
+    _, components, ny, nz, *_ = matrix.shape
+    size = components * ny * nz
     block = np.zeros((len(rows), size, len(columns), size))
+    one, other, inside = _pattern(components, ny, nz)
     for i, row in enumerate(rows):
         for j, column in enumerate(columns):
+            # Those of planes of x that are further apart are 0.
             if abs(row - column) <= DEGREE:
-                block[i, :, j] = plane_block(matrix, row, column)
+                block[i, one, j, other] = matrix[row, :, :, :, column - row + DEGREE][inside]
     return block.reshape(len(rows) * size, len(columns) * size)

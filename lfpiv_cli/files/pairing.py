@@ -348,9 +348,27 @@ def places_of(stems: Sequence[str], how: Pairing) -> list[Place | None]:
         alike[tuple(kinds)].append(number)
     for members in alike.values():
         group = [read[number][0] for number in members]
-        places = _read_together(group, how, [read[number][1] for number in members])
-        for number, place in zip(members, places, strict=True):
-            found[number] = place
+        # Which token is the letter of a frame: where both are seen, the last such.
+        letters = [k for k, token in enumerate(group[0]) if token in MARKS]
+        seen = [k for k in letters if len({MARKS[tokens[k]] for tokens in group}) == 2]
+        if not seen and how != "sequence":
+            # Unless it is of the number of a buffer, with which names begin as `B00001` and `B0001_0` do.
+            first, second, *_ = [*group[0], "", ""]
+            buffers = first == BUFFER and _is_number(second) and (len(second) == BUFFER_DIGITS or _ends_in_frame(group))
+            seen = [k for k in letters if k or not buffers]
+        mark = seen[-1] if seen else None
+        marks = [] if mark is None else [MARKS[tokens[mark]] for tokens in group]
+        if mark is None and how == "ab" and _ends_in_frame(group):
+            mark = len(group[0]) - 1
+            least = min(int(tokens[mark]) for tokens in group)
+            marks = [int(tokens[mark]) - least for tokens in group]
+        rest = [[*tokens[:mark], "?", *tokens[mark + 1 :]] if mark is not None else tokens for tokens in group]
+        for k, (member, tokens) in enumerate(zip(members, rest, strict=True)):
+            series, running = _numbered(tokens, rest)
+            if mark is not None:
+                found[member] = Place(series, running or 0, marks[k])
+            elif (position := read[member][1] if running is None else running) is not None:
+                found[member] = Place(series, position)
     return found
 
 
@@ -410,33 +428,6 @@ def _tokens(stem: str) -> tuple[list[str], int | None]:
             ticks = (moment - datetime(1970, 1, 1)) // micro + int(fraction.ljust(6, "0"))
             rest = stem[: stamp.start()] + STAMP + stem[stamp.end() :]
     return [token.casefold() for token in TOKEN.findall(rest)], ticks
-
-
-def _read_together(group: Sequence[list[str]], how: Pairing, stamps: Sequence[int | None]) -> list[Place | None]:
-    """Return what names of one form say."""
-    # Which token is the letter of a frame: where both are seen, the last such.
-    letters = [k for k, token in enumerate(group[0]) if token in MARKS]
-    seen = [k for k in letters if len({MARKS[tokens[k]] for tokens in group}) == 2]
-    if not seen and how != "sequence":
-        # Unless it is of the number of a buffer, with which names begin as `B00001` and `B0001_0` do.
-        first, second, *_ = [*group[0], "", ""]
-        buffers = first == BUFFER and _is_number(second) and (len(second) == BUFFER_DIGITS or _ends_in_frame(group))
-        seen = [k for k in letters if k or not buffers]
-    mark = seen[-1] if seen else None
-    marks = [] if mark is None else [MARKS[tokens[mark]] for tokens in group]
-    if mark is None and how == "ab" and _ends_in_frame(group):
-        mark = len(group[0]) - 1
-        least = min(int(tokens[mark]) for tokens in group)
-        marks = [int(tokens[mark]) - least for tokens in group]
-    rest = [[*tokens[:mark], "?", *tokens[mark + 1 :]] if mark is not None else tokens for tokens in group]
-    places: list[Place | None] = []
-    for k, (series, number) in enumerate(_numbered(tokens, rest) for tokens in rest):
-        if mark is not None:
-            places.append(Place(series, number or 0, marks[k]))
-        else:
-            position = stamps[k] if number is None else number
-            places.append(None if position is None else Place(series, position))
-    return places
 
 
 def _ends_in_frame(group: Sequence[list[str]]) -> bool:

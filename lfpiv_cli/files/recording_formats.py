@@ -230,7 +230,24 @@ def _read_tiff(path: Path, places: Sequence[int], number: int, shape: Shape | No
             raise InputError(f"page {number} is packed as {name}, for black and white alone: {GREY_HINT}")
         size, declared = tiff.filehandle.size, (page.imagelength, page.imagewidth)
         ensure_size(f"page {number}", declared, page.dtype.itemsize * page.samplesperpixel, shape, size)
-        _ensure_segments(page, number, size)
+        # The decoder asks none of these: of a strip that is too short and not packed it takes the bytes after it as
+        # pixels, and of one that is far too long it reads all.
+        segments = math.prod(page.chunked)
+        if not len(page.dataoffsets) == len(page.databytecounts) == segments:
+            raise InputError(f"page {number} has {len(page.dataoffsets)} of its {segments} strips or tiles: {CUT}")
+        for segment, (place, length) in enumerate(zip(page.dataoffsets, page.databytecounts, strict=True)):
+            if length == 0 or place + length > size:
+                raise InputError(f"the data of page {number} ends at byte {place + length} of {size}: {CUT}")
+            rows, columns, *samples = page.chunks
+            if not page.is_tiled:  # whose last ones are filled up, where the last strip is shorter
+                rows = min(rows, page.imagelength - segment % -(-page.imagelength // rows) * rows)
+            # Where it is not packed; each of its rows takes whole bytes.
+            pixels = rows * -(-columns * math.prod(samples) * page.bitspersample // 8)
+            least, most = pixels if page.compression == NOT_PACKED else 1, recordings.HARMLESS_BYTES + 2 * pixels
+            if not least <= length <= most:
+                raise InputError(
+                    f"strip or tile {segment} of page {number} has {length} bytes, its pixels take {pixels}: {CUT}"
+                )
         array = page.asarray(maxworkers=1)
         if page.samplesperpixel > 1 and page.planarconfig == SEPARATE:
             array = np.moveaxis(array, 0, -1)
@@ -256,30 +273,6 @@ def _naming(path: Path) -> Iterator[None]:
         raise InputError(f"{path}: cannot be decoded: {reason(error)}") from error
     finally:
         recordings.reading.reset(token)
-
-
-def _ensure_segments(page: tifffile.TiffPage, number: int, file_bytes: int) -> None:
-    """Refuse strips or tiles that are missing, lie beyond the file's end, or are shorter than their pixels.
-
-    The decoder asks none of these: of a strip that is too short and not packed it takes the bytes after it as pixels,
-    and of one that is far too long it reads all.
-    """
-    segments = math.prod(page.chunked)
-    if not len(page.dataoffsets) == len(page.databytecounts) == segments:
-        raise InputError(f"page {number} has {len(page.dataoffsets)} of its {segments} strips or tiles: {CUT}")
-    for segment, (place, length) in enumerate(zip(page.dataoffsets, page.databytecounts, strict=True)):
-        if length == 0 or place + length > file_bytes:
-            raise InputError(f"the data of page {number} ends at byte {place + length} of {file_bytes}: {CUT}")
-        rows, columns, *samples = page.chunks
-        if not page.is_tiled:  # whose last ones are filled up, where the last strip is shorter
-            rows = min(rows, page.imagelength - segment % -(-page.imagelength // rows) * rows)
-        # Where it is not packed; each of its rows takes whole bytes.
-        pixels = rows * -(-columns * math.prod(samples) * page.bitspersample // 8)
-        least, most = pixels if page.compression == NOT_PACKED else 1, recordings.HARMLESS_BYTES + 2 * pixels
-        if not least <= length <= most:
-            raise InputError(
-                f"strip or tile {segment} of page {number} has {length} bytes, its pixels take {pixels}: {CUT}"
-            )
 
 
 # Datasets of HDF5.

@@ -137,7 +137,23 @@ def _read_document(content: bytes, source: str) -> Document:
         line, column = text.count("\n", 0, found.start()) + 1, found.start() - text.rfind("\n", 0, found.start())
         raise _broken(source, line, column, f"holds the control character {ord(found.group()):#04x}")
     try:
-        _ensure_plain(text, source)
+        # On the flat stream of events, before any tree is built.
+        depth = documents = 0
+        for event in yaml.parse(text, Loader=LOADER):
+            documents += isinstance(event, yaml.DocumentStartEvent)
+            depth += isinstance(event, (yaml.MappingStartEvent, yaml.SequenceStartEvent))
+            depth -= isinstance(event, (yaml.MappingEndEvent, yaml.SequenceEndEvent))
+            if isinstance(event, yaml.AliasEvent) or getattr(event, "anchor", None):
+                fault = "uses an anchor or alias (& or *), which are not read here"
+            elif (tag := getattr(event, "tag", None)) is not None:
+                fault = f"uses the tag {tag}, which is not read here"
+            elif documents > 1:
+                fault = "holds a second document, expected one"
+            elif depth > DEEPEST:
+                fault = f"is nested deeper than {DEEPEST} levels"
+            else:
+                continue
+            raise _broken(source, *_place(event), fault)
         root = yaml.compose(text, Loader=LOADER)
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
@@ -153,26 +169,6 @@ def _read_document(content: bytes, source: str) -> Document:
     if root is not None:
         document.data = _plain(root, (), document)
     return document
-
-
-def _ensure_plain(text: str, source: str) -> None:
-    """Refuse aliases, tags, depth and further documents on the flat stream of events, before any tree is built."""
-    depth = documents = 0
-    for event in yaml.parse(text, Loader=LOADER):
-        documents += isinstance(event, yaml.DocumentStartEvent)
-        depth += isinstance(event, (yaml.MappingStartEvent, yaml.SequenceStartEvent))
-        depth -= isinstance(event, (yaml.MappingEndEvent, yaml.SequenceEndEvent))
-        if isinstance(event, yaml.AliasEvent) or getattr(event, "anchor", None):
-            fault = "uses an anchor or alias (& or *), which are not read here"
-        elif (tag := getattr(event, "tag", None)) is not None:
-            fault = f"uses the tag {tag}, which is not read here"
-        elif documents > 1:
-            fault = "holds a second document, expected one"
-        elif depth > DEEPEST:
-            fault = f"is nested deeper than {DEEPEST} levels"
-        else:
-            continue
-        raise _broken(source, *_place(event), fault)
 
 
 def _plain(node: yaml.Node, path: KeyPath, document: Document) -> Any:
@@ -262,7 +258,15 @@ def sentence(source: str, problem: Problem) -> str:
 
 def problem_of(document: Document, details: ErrorDetails) -> Problem:
     """Return a validation error as a sentence about a place."""
-    path = _path_in(document.data, details["loc"])
+    # pydantic's place, without the names of union members, which are not in the data.
+    path: KeyPath = ()
+    data: Any = document.data
+    for number, part in enumerate(details["loc"]):
+        inside = part in data if isinstance(data, Mapping) else isinstance(data, tuple) and isinstance(part, int)
+        if inside:
+            data = data[part] if isinstance(data, Mapping) or part < len(data) else None  # type: ignore[operator]
+        if inside or (number == len(details["loc"]) - 1 and isinstance(data, Mapping)):
+            path = (*path, part)
     kind, value, context = details["type"], details["input"], details.get("ctx", {})
     place = place_of(document, path)
     if kind == "extra_forbidden":
@@ -300,19 +304,6 @@ def _models_in(annotation: Any) -> list[Any]:
     if hasattr(annotation, "model_fields"):
         return [annotation]
     return [model for inner in getattr(annotation, "__args__", ()) for model in _models_in(inner)]
-
-
-def _path_in(data: Any, location: tuple[int | str, ...]) -> KeyPath:
-    """Return pydantic's place without the names of union members, which are not in the data."""
-    path: list[int | str] = []
-    for number, part in enumerate(location):
-        inside = part in data if isinstance(data, Mapping) else isinstance(data, tuple) and isinstance(part, int)
-        if inside:
-            data = data[part] if isinstance(data, Mapping) or part < len(data) else None  # type: ignore[operator]
-            path.append(part)
-        elif number == len(location) - 1 and isinstance(data, Mapping):
-            path.append(part)
-    return tuple(path)
 
 
 def place_of(document: Document, path: KeyPath) -> tuple[int, int]:

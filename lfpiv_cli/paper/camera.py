@@ -424,12 +424,22 @@ def discussion(work: Work) -> Findings:
     geometric = geometric_depth_mm(camera, media)
     per_pixel = (camera.pixel_mm / float(camera.lattice.pitch[0])) ** 2
     sigma = np.array(reported["sigma_mm"])
+    rows = []
+    for depth, length in zip(reported["elongation_depth_mm"], reported["elongation_mm"], strict=True):
+        x, _, z = (float(np.interp(depth, reported["depth_mm"], each)) for each in sigma.T)
+        rows.append((f"{depth:+.0f}", f"{length:.2f}", f"{1e3 * x:.2f}", f"{1e3 * z:.1f}"))
     return Findings(
         drawings=(
             Drawing.of("depth", depth_resolution_figure, reported, geometric, float(camera.scale(media).lens_mm)),
             Drawing.of("seeding", seeding_bound_figure, crowd, PAPERS_PPP / per_pixel),
         ),
-        tables=(_by_depth_table(reported),),
+        tables=(
+            Table(
+                "By depth behind the focal plane",
+                ("depth (mm)", "length by SART (mm)", "smallest error across (µm)", "smallest error in depth (µm)"),
+                tuple(rows),
+            ),
+        ),
         text=(
             f"The outermost views of the paper's camera move against each other by one microlens in {geometric:.2f} mm "
             f"of depth: that is why a tracer reconstructed by SART ({reported['iterations']} iterations) is "
@@ -466,17 +476,3 @@ def _by_seeding(work: Work, camera: Camera, media: Media) -> dict[str, Any]:
     rng = np.random.default_rng(SEED_OF_DISCUSSION)
     sigma = [smallest_errors_crowded_mm(crowded, media, each, SLAB_MM, Readout(), rng).tolist() for each in seedings]
     return {"per_lens": list(seedings), "sigma_mm": sigma}
-
-
-def _by_depth_table(reported: Mapping[str, Any]) -> Table:
-    """Return elongation and bound at the depths that have both."""
-    sigma = np.array(reported["sigma_mm"])
-    rows = []
-    for depth, length in zip(reported["elongation_depth_mm"], reported["elongation_mm"], strict=True):
-        x, _, z = (float(np.interp(depth, reported["depth_mm"], each)) for each in sigma.T)
-        rows.append((f"{depth:+.0f}", f"{length:.2f}", f"{1e3 * x:.2f}", f"{1e3 * z:.1f}"))
-    return Table(
-        "By depth behind the focal plane",
-        ("depth (mm)", "length by SART (mm)", "smallest error across (µm)", "smallest error in depth (µm)"),
-        tuple(rows),
-    )

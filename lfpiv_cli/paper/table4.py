@@ -165,10 +165,28 @@ def table4(work: Work) -> Findings:
         reported: _read(configs[name], work.folder / name) for name, reported in SHOWN.items() if name in configs
     }
     duct = simulated_duct(configs["ert"])
+    experiment = Table(
+        "The experiment (after Fig. 14)",
+        ("", "paper", "here"),
+        (
+            ("channel's section", "10 x 10 mm", f"{size.width_mm:g} x {size.width_mm:g} mm"),
+            ("wall, acrylic", "5 mm", "5 mm"),
+            ("measured length", "13 mm", f"{size.length_mm:g} mm"),
+            ("mean velocity", "0.1082 m/s", f"{MEAN_VELOCITY_M_S} m/s"),
+            ("time between the frames", "1.8 ms", "1.8 ms"),
+            ("tracers, diameter", "50 µm", "50 µm"),
+            ("tracers", "0.002 per pixel", f"{size.particles / (size.columns * size.rows):.4f} per pixel"),
+            ("voxels", "0.1 mm", f"{VOXEL_MM:g} mm"),
+            ("interrogation windows", "16 voxels, overlap 50 %", f"{size.windows[-1]} voxels, overlap 50 %"),
+            ("SART", "200 iterations, relaxation 1", f"{size.iterations} iterations, relaxation 1"),
+            ("camera", "Table 2", f"Table 2, {size.columns} x {size.rows} pixels"),
+            ("truth", "CFD", "series of the laminar flow"),
+        ),
+    )
     return Findings(
         rows=_rows(found),
         drawings=_drawings(methods, duct),
-        tables=(_table(found), _setup(size)),
+        tables=(_table(found), experiment),
         text=_text(work, size, found),
         commands=tuple(f"lfpiv validate flow work/table4/{name}.yaml -o table4-{name}" for name in configs),
         seeds=(SEED,),
@@ -296,28 +314,6 @@ def _table(found: Mapping[str, Mapping[str, Any]]) -> Table:
         rows.append(tuple(row.values()))
     caption = f"The flow by all ways to measure it; its true mean velocity is {MEAN_VELOCITY_M_S} m/s"
     return Table(caption, tuple(row), tuple(rows))
-
-
-def _setup(size: ChannelSize) -> Table:
-    """Return the experiment in numbers."""
-    return Table(
-        "The experiment (after Fig. 14)",
-        ("", "paper", "here"),
-        (
-            ("channel's section", "10 x 10 mm", f"{size.width_mm:g} x {size.width_mm:g} mm"),
-            ("wall, acrylic", "5 mm", "5 mm"),
-            ("measured length", "13 mm", f"{size.length_mm:g} mm"),
-            ("mean velocity", "0.1082 m/s", f"{MEAN_VELOCITY_M_S} m/s"),
-            ("time between the frames", "1.8 ms", "1.8 ms"),
-            ("tracers, diameter", "50 µm", "50 µm"),
-            ("tracers", "0.002 per pixel", f"{size.particles / (size.columns * size.rows):.4f} per pixel"),
-            ("voxels", "0.1 mm", f"{VOXEL_MM:g} mm"),
-            ("interrogation windows", "16 voxels, overlap 50 %", f"{size.windows[-1]} voxels, overlap 50 %"),
-            ("SART", "200 iterations, relaxation 1", f"{size.iterations} iterations, relaxation 1"),
-            ("camera", "Table 2", f"Table 2, {size.columns} x {size.rows} pixels"),
-            ("truth", "CFD", "series of the laminar flow"),
-        ),
-    )
 
 
 def _drawings(methods: Mapping[str, Measured], duct: Duct) -> tuple[Drawing, ...]:

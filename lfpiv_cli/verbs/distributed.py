@@ -209,7 +209,17 @@ class _Outputs:
                 if not at_work.done():
                     self._worker_ended(at_work)
             if deadline.leaves_time():
-                self._hand_out(workers, deadline.leaves_time(2))
+                if not self._left and not self._running:
+                    # What another command was making may be left by it.
+                    time.sleep(SECONDS_BETWEEN_LOOKS)
+                    self._left, self._claimed = Runs(self._claimed), []
+                at_work_on = Counter(worker for _, worker in self._running.values())
+                for worker in sorted(worker for worker in workers if not at_work_on[worker]):
+                    self._give(worker)
+                # One to go on with; the last outputs are kept for whoever is done first.
+                for worker in sorted(worker for worker in workers if at_work_on[worker] < 2):
+                    if len(self._left) > len(workers) and deadline.leaves_time(2):
+                        self._give(worker)
             for number, reply in self._done():
                 if reply.made is Turn.CLAIMED:
                     self._claimed.append(number)
@@ -225,22 +235,6 @@ class _Outputs:
         if self._running:
             with contextlib.suppress(OSError):
                 self._client.cancel(list(self._running), force=True)
-
-    def _hand_out(self, workers: set[str], ahead: bool) -> None:
-        """Give each worker that has nothing to do an output; then one to go on with, if it is to be done `ahead`.
-
-        The last outputs are kept for whoever is done first.
-        """
-        if not self._left and not self._running:
-            # What another command was making may be left by it.
-            time.sleep(SECONDS_BETWEEN_LOOKS)
-            self._left, self._claimed = Runs(self._claimed), []
-        given = Counter(worker for _, worker in self._running.values())
-        for worker in sorted(worker for worker in workers if not given[worker]):
-            self._give(worker)
-        for worker in sorted(worker for worker in workers if given[worker] < 2):
-            if ahead and len(self._left) > len(workers):
-                self._give(worker)
 
     def _give(self, worker: str) -> None:
         """Give a worker an output, if there is one left."""

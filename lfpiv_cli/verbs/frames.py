@@ -334,7 +334,18 @@ def frame_notices(bench: Bench, raw: Image, lit: Image, name: str) -> list[Notic
     seen, used = np.where(unusable, np.float32(np.nan), lit), lit[~unusable]
     share = light_checks.saturated_share(seen, unusable & ~bench.lasting, bench.lens_images.background(seen))
     notices = light_checks.exposure_notices(share, name)
-    brightest, noise = float(used.max() - np.median(used)), _noise(seen)
+    # At most the noise's standard deviation, by what lies below 0, around the median, or between pixels side by side:
+    # crowded tracers leave no pixel dark and are what spreads around the median, but their light changes little from
+    # one pixel to the next.
+    counts = seen[np.isfinite(seen)]
+    steps = np.concatenate([np.diff(seen, axis=axis).ravel() for axis in (0, 1)])
+    steps, below = steps[np.isfinite(steps)], counts[counts < 0.0]
+    noise = MAD_TO_SIGMA * float(np.median(np.abs(counts - np.median(counts))))
+    if steps.size:
+        noise = min(noise, MAD_TO_SIGMA * float(np.median(np.abs(steps))) / np.sqrt(2.0))
+    if below.size:
+        noise = min(noise, float(np.median(-below)) / HALF_NORMAL_MEDIAN)
+    brightest = float(used.max() - np.median(used))
     if brightest <= NOISE_SIGMAS * noise:
         text = (
             f"its brightest pixel is {written(brightest)} counts above the others, with a noise of "
@@ -363,22 +374,6 @@ def haze_notices(attributes: Mapping[str, Any], name: str) -> list[Notice]:
     )
     remedy = "less scattered light: clean windows and fluid, a dark wall behind, a filter before fluorescent tracers"
     return [Notice("haze", name, text, remedy, level, "none above the noise")]
-
-
-def _noise(seen: Singles) -> float:
-    """Return at most the standard deviation of an image's noise, its unusable pixels NaN.
-
-    By what lies below 0, around the median, or between pixels side by side: crowded tracers leave no pixel dark
-    and are what spreads around the median, but their light changes little from one pixel to the next.
-    """
-    counts = seen[np.isfinite(seen)]
-    steps = np.concatenate([np.diff(seen, axis=axis).ravel() for axis in (0, 1)])
-    steps = steps[np.isfinite(steps)]
-    noise = MAD_TO_SIGMA * float(np.median(np.abs(counts - np.median(counts))))
-    if steps.size:
-        noise = min(noise, MAD_TO_SIGMA * float(np.median(np.abs(steps))) / np.sqrt(2.0))
-    below = counts[counts < 0.0]
-    return min(noise, float(np.median(-below)) / HALF_NORMAL_MEDIAN) if below.size else noise
 
 
 def picture_for(weights: WeightsFile, picture: NDArray[Any]) -> Image:
