@@ -26,8 +26,9 @@ from lfpiv_cli.grid import Grid, Reference
 from lfpiv_cli.pictures.points import MOST_LINES, Lines, has_views, lines_view, wall_dots
 from lfpiv_cli.verbs import checks
 from lfpiv_cli.verbs import report as stage
+from lfpiv_cli.verbs.contents import contents_of, judged
 from lfpiv_cli.verbs.plot import figures_of
-from lfpiv_cli.verbs.report import ReportOptions, contents_of, judged, report
+from lfpiv_cli.verbs.report import ReportOptions, report
 from tests.browser import CHROMIUM, opened
 from tests.commands import ROOT, run, table2_rig, told
 from tests.vector_fields import SHAPE, SIGMA_VOXEL, field_of, noise_mm, rotation_mm

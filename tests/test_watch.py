@@ -25,9 +25,9 @@ from lfpiv_cli.verbs import particles
 from lfpiv_cli.verbs import run as watching
 from lfpiv_cli.verbs.batches import Failure
 from lfpiv_cli.verbs.checks import Line, Part
+from lfpiv_cli.verbs.contents import Contents, Fields
 from lfpiv_cli.verbs.pairs import PairOptions, coming_pairs
 from lfpiv_cli.verbs.particles import Sized
-from lfpiv_cli.verbs.report import Contents, Fields
 from lfpiv_cli.verbs.run import RIG
 from lfpiv_cli.verbs.simulate import frame_names
 from tests.commands import SAMPLE, sample_rig

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import json
 import math
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from html import escape
-from itertools import combinations
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
@@ -19,17 +17,16 @@ import yaml
 from lfpiv_cli.arrays import Floats
 from lfpiv_cli.console import CONSOLE, Console, readable
 from lfpiv_cli.errors import ConfigError, InputError, UsageError
-from lfpiv_cli.files import calibration_file, pages, particle_file, weights_file
+from lfpiv_cli.files import pages, particle_file
 from lfpiv_cli.files.atomic import ensure_writable
 from lfpiv_cli.files.calibration_file import open_calibration
 from lfpiv_cli.files.config import carried_config
-from lfpiv_cli.files.hdf5 import open_h5, read_provenance
 from lfpiv_cli.files.images import count_pages
 from lfpiv_cli.files.listing import natural
 from lfpiv_cli.files.pages import Page, Picture, Section, Table, write_pages, write_picture
-from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, TRACKS_FORMAT, TRAJECTORIES_FORMAT, Points
+from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, Points
 from lfpiv_cli.files.provenance import sha256
-from lfpiv_cli.files.vtkhdf import VECTORS_FORMAT, VOLUME_FORMAT, open_vectors, read_extra, read_header
+from lfpiv_cli.files.vtkhdf import open_vectors, read_extra, read_header
 from lfpiv_cli.flow.field import MASKED, MM_TO_M, REJECTED, VALID, VectorField
 from lfpiv_cli.flow.statistics import PAIRS
 from lfpiv_cli.flow.windows import Walls
@@ -38,32 +35,17 @@ from lfpiv_cli.pictures.points import MOST_LINES, Lines, displacement_lines, has
 from lfpiv_cli.pictures.style import caption_of
 from lfpiv_cli.pictures.vectors import planes_figure, profiles_figure, series_figure, sigma_figure, speed_unit
 from lfpiv_cli.verbs import checks
+from lfpiv_cli.verbs.contents import Contents, Fields, by_command, contents_of, judged
 from lfpiv_cli.verbs.moments import of_fields
 from lfpiv_cli.verbs.plot import figures_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-# By the formats of our files, in the order of the chain.
-KINDS = {
-    calibration_file.FORMAT: "calibration",
-    weights_file.FORMAT: "weights",
-    VOLUME_FORMAT: "volumes",
-    PARTICLES_FORMAT: "particles",
-    VECTORS_FORMAT: "vectors",
-    TRACKS_FORMAT: "tracks",
-    TRAJECTORIES_FORMAT: "tracks",
-}
-SUFFIXES = (".h5", ".vtkhdf")
-# Folders below the one that is given: of volumes, of particles, of a batch's vectors.
-DEEPEST = 2
 # Tables of vectors end here, and others.
 LONGEST_TABLE, LONGEST_OTHER, LONGEST_INPUTS = 60, 8, 12
-# So many files of vectors are read, and so many reasons of one kind are told.
-MOST_FIELDS, MOST_REASONS = 1000, 3
-# Commands, by their records, whose vectors are made of others that stand beside them.
-MEAN = "correlate mean"
-MADE_OF_OTHERS = (MEAN, "statistics", "combine")
+# So many files of vectors are read.
+MOST_FIELDS = 1000
 # What is drawn of the vectors that the verdict is of, of others, and of other files: a page of paper holds three.
 OF_VECTORS, OF_OTHERS = ("planes", "profiles", "sigma"), ("planes",)
 # Of the mean of many, in the order of what is left out first of others' means.
@@ -74,8 +56,6 @@ OF_TRACKS, OF_WEIGHTS = ("space", "sigma"), ("light",)
 FAINT_WORDS = "those of large stated errors faint, walls dotted"
 # A cell of a figure that is not known.
 UNKNOWN = "–"
-# Vectors by their files.
-Fields = Mapping[Path, VectorField]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,37 +63,6 @@ class ReportOptions:
     """What `report` is given besides the folder: raw images, of which it shows those that the files are made from."""
 
     raw: Sequence[Path] = ()
-
-
-@dataclass(frozen=True)
-class Contents:
-    """The files of ours in a folder by what they are, and the record of each by its name in the folder.
-
-    `earlier` are the records of what they were made from that is not in the folder, as volumes that were not kept.
-    """
-
-    folder: Path
-    files: Mapping[str, list[Path]]
-    records: Mapping[str, Mapping[str, Any]]
-    earlier: Mapping[str, Mapping[str, Any]]
-
-    def of(self, kind: str) -> list[Path]:
-        """Return the files of a kind, in the order of their names."""
-        return self.files.get(kind, [])
-
-    def record(self, path: Path) -> Mapping[str, Any]:
-        """Return the record of a file."""
-        return self.records[path.relative_to(self.folder).as_posix()]
-
-    @property
-    def all_records(self) -> Mapping[str, Mapping[str, Any]]:
-        """The records of all that the results come from, whether it is in the folder or not."""
-        return {**self.earlier, **self.records}
-
-    @property
-    def last(self) -> Mapping[str, Any]:
-        """The record of the file that was made last."""
-        return list(self.records.values())[-1]
 
 
 def report(
@@ -170,7 +119,7 @@ def _sentence(contents: Contents, fields: Fields, faults: int) -> str:
     against = "nothing contradicts it"
     if faults:
         against = f"{faults} faults speak against it" if faults > 1 else "one fault speaks against it"
-    first, tracks = next(iter(_by_command(contents, fields).values()), []), contents.of("tracks")
+    first, tracks = next(iter(by_command(contents, fields).values()), []), contents.of("tracks")
     if tracks and (not first or (len(first) == 1 and checks.verb_of(contents.record(first[0])) != "correlate")):
         points = particle_file.open_tracks(tracks[0])
         track = points.arrays.get("track")
@@ -200,74 +149,6 @@ def _sentence(contents: Contents, fields: Fields, faults: int) -> str:
     if len(known):
         text += f", known to {written(max(error[:2]), 2)} m/s across and {written(error[2], 2)} m/s in depth"
     return f"{text}; {against}."
-
-
-def judged(contents: Contents, fields: Fields) -> dict[checks.Part, list[checks.Line]]:
-    """Return what speaks for and against each part of the chain, the worst first."""
-    ours = _by_command(contents, fields)
-    others = list(ours)[1:]
-    of_others = {name: made for name, made in contents.all_records.items() if checks.verb_of(made) in others}
-    records = {name: made for name, made in contents.all_records.items() if name not in of_others}
-    reasons = [*checks.of_warnings(records), *_of_all_vectors(contents, fields)]
-    reasons += [replace(each, verdict="good") for each in checks.of_warnings(of_others)]
-    if others:
-        text = f"the verdict on vectors is of those by {next(iter(ours))}; what is said of those by"
-        reasons.append(checks.Line("vectors", "good", f"{text} {' and '.join(others)} does not count in it"))
-    made_by = {checks.verb_of(record) for record in contents.all_records.values()}
-    counted: list[tuple[checks.Part, bool, str]] = [
-        (
-            "calibration",
-            not made_by.isdisjoint(checks.CALIBRATES),
-            "no calibration: lengths are as the data sheet has them",
-        ),
-        ("images", not made_by.isdisjoint(checks.OF_IMAGES), "no volumes and no particles"),
-        ("vectors", bool(contents.of("vectors") or contents.of("tracks")), "no vectors and no tracks"),
-    ]
-    reasons += [checks.Line(part, "look", text) for part, there, text in counted if not there]
-    return {part: checks.worst_first(reasons, part) for part, _, _ in counted}
-
-
-def contents_of(folder: Path, only: Iterable[Path] | None = None) -> Contents:
-    """Return what a folder holds, and the folders in it; or `only` some of its files, as far as they are there.
-
-    Raises
-    ------
-    InputError : it is no folder, holds nothing of ours, or a broken file
-    """
-    if not os.path.isdir(folder):
-        raise InputError(f"{folder}: is no folder of results")
-    files: dict[str, list[Path]] = {}
-    records: dict[str, Mapping[str, Any]] = {}
-    paths = folder.rglob("*") if only is None else (path for path in only if path.exists())
-    ours = (path for path in paths if path.suffix in SUFFIXES)
-    for path in sorted(ours, key=lambda path: (natural(path.as_posix()), path)):
-        parts = path.relative_to(folder).parts
-        if len(parts) > DEEPEST or any(part.startswith(".") for part in parts):
-            continue
-        with open_h5(path) as file:
-            format_name = file.attrs.get("format", b"")
-            kind = KINDS.get(format_name.decode() if isinstance(format_name, bytes) else "")
-            if kind is None:
-                continue
-            records["/".join(parts)] = read_provenance(file)
-        files.setdefault(kind, []).append(path)
-    if not records:
-        raise InputError(f"{folder}: holds no file of lfpiv; expected what calibrate-snapshot and the others write")
-    order = list(dict.fromkeys(KINDS.values()))
-    in_order = {kind: files[kind] for kind in order if kind in files}
-    names = [path.relative_to(folder).as_posix() for kind in in_order.values() for path in kind]
-    # What files were made from, by name and hash, but for what is among these files.
-    there = [{name: value for name, value in made.items() if name != "made_from"} for made in records.values()]
-    behind = {digest: made for each in records.values() for digest, made in each.get("made_from", {}).items()}
-    inputs = [given for made in (*there, *behind.values()) for given in made.get("inputs", {}).values()]
-    called = {given["sha256"]: given["name"] for given in inputs}
-    known = {json.dumps(made, sort_keys=True) for made in there}
-    earlier = {
-        f"{called.get(digest, '')} ({digest[:8]}, not in the folder)": made
-        for digest, made in behind.items()
-        if json.dumps(made, sort_keys=True) not in known
-    }
-    return Contents(folder, in_order, {name: records[name] for name in names}, earlier)
 
 
 @dataclass
@@ -309,55 +190,9 @@ class Drawer:
         return Picture(target, caption)
 
 
-def _by_command(contents: Contents, fields: Fields) -> dict[str, list[Path]]:
-    """Return the files of vectors by the command that made them, those that the verdict is of first.
-
-    These are the ones that least speaks against, of several the ones with the smallest stated errors. What is made of
-    them, combined or as a mean, comes last.
-    """
-    found: dict[str, list[Path]] = {}
-    for path in fields:
-        made = contents.record(path)
-        found.setdefault(MEAN if made.get("command") == MEAN else checks.verb_of(made), []).append(path)
-
-    def rank(command: str) -> tuple[bool, int, float]:
-        paths = found[command]
-        lines = [line for path in paths for line in checks.of_vectors(fields[path], path.name)]
-        lines += checks.of_warnings({str(path): contents.record(path) for path in paths})
-        sigma = float(np.median([_sigma(fields[path]) for path in paths]))
-        return command in MADE_OF_OTHERS, checks.ORDER.index(checks.worst(lines)), sigma
-
-    return {command: found[command] for command in sorted(found, key=rank)}
-
-
-def _of_all_vectors(contents: Contents, fields: Fields) -> list[checks.Line]:
-    """Return what vectors say of themselves and of each other.
-
-    What speaks against vectors that better ones by another command stand beside is told, and not counted.
-    """
-    reasons: list[checks.Line] = []
-    by_command, faulty = _by_command(contents, fields), set()
-    for number, paths in enumerate(by_command.values()):
-        found = [each for path in paths for each in checks.of_vectors(fields[path], path.name)]
-        against = [each for each in found if each.verdict != "good"]
-        warned = checks.of_warnings({str(path): contents.record(path) for path in paths})
-        faulty |= {path for path in paths if checks.worst([*against, *warned], "good") != "good"}
-        reasons += [replace(each, verdict="good") if number else each for each in against[:MOST_REASONS]]
-        if len(against) > MOST_REASONS:
-            text = f"{len(against) - MOST_REASONS} more reasons like these in other files"
-            reasons.append(checks.Line("vectors", "good" if number else "look", text))
-        reasons += [each for each in found if each.verdict == "good"][:1]
-    if all(len(paths) == 1 for paths in by_command.values()):
-        for one, other in combinations([path for paths in by_command.values() for path in paths], 2):
-            differ = checks.of_two_ways(fields[one], fields[other], (one.name, other.name))
-            # From vectors that are told to be poor others may differ.
-            reasons += [replace(each, verdict="good") if {one, other} & faulty else each for each in differ]
-    return reasons
-
-
 def _chain(contents: Contents, fields: Fields, drawer: Drawer) -> Iterable[Section]:
     """Yield the sections of vectors, tracks, images and calibration, as far as they are there."""
-    groups, pictures, views = _by_command(contents, fields), list[Picture](), Views()
+    groups, pictures, views = by_command(contents, fields), list[Picture](), Views()
     if fields:
         first = next(iter(groups.values()))
         # Of many pairs the pictures show what is by other commands, too.
@@ -417,12 +252,6 @@ def _chain(contents: Contents, fields: Fields, drawer: Drawer) -> Iterable[Secti
         yield Section("Calibration", "calibration", tables=(table,), pictures=tuple(pictures))
     for path in contents.of("weights")[:1]:
         yield Section("Weights", "weights", pictures=tuple(drawer.pictures(path, only=OF_WEIGHTS)))
-
-
-def _sigma(field: VectorField) -> float:
-    """Return the size of the usual stated error of vectors, mm; infinite where none is stated."""
-    sigma = checks.quality_of(field).summary()["uncertainty_voxel_median"]
-    return float("inf") if sigma is None else float(np.linalg.norm(np.multiply(sigma, field.voxel_mm)))
 
 
 def _statistics(path: Path) -> Iterable[Table]:

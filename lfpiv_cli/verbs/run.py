@@ -40,12 +40,12 @@ from lfpiv_cli.notice import with_error, written
 from lfpiv_cli.pictures.vectors import planes_figure
 from lfpiv_cli.verbs import build_weights, calibrate, checks, correlate, particles, run_choice, run_steps
 from lfpiv_cli.verbs.batches import ALL, MB, Expected, Failure, dry_run, estimate
+from lfpiv_cli.verbs.contents import contents_of, judged
 from lfpiv_cli.verbs.follow import follow_particles
 from lfpiv_cli.verbs.following import SHORTEST, ensure_sequence
 from lfpiv_cli.verbs.frames import readable
 from lfpiv_cli.verbs.pairs import coming_pairs, found_pairs, watched
 from lfpiv_cli.verbs.particles import LOOKED_AT, Prepared
-from lfpiv_cli.verbs.report import contents_of, judged
 from lfpiv_cli.verbs.run_choice import Choice
 from lfpiv_cli.verbs.run_steps import Chain, RunOptions, Steps
 from lfpiv_cli.verbs.simulate import frame_names, simulate_board, simulate_particles, simulate_white
