@@ -112,6 +112,27 @@ def test_partners_are_found_as_far_as_tracers_go_at_any_magnification(
         assert moved.right(track(moved.first, moved.second, scale, 2.0 * scale.lens_mm))[0] == 0.0
 
 
+@pytest.mark.parametrize(("count", "least"), [(1, 0.0), (3, 0.0), (6, 0.9), (30, 0.97)])
+def test_few_tracers_that_go_far_are_linked_rightly_or_not_at_all(
+    count: int, least: float, rng: np.random.Generator
+) -> None:
+    """They move by 11 of the view's 40 x 30 microlenses; half as many others are there."""
+    box, sigma = TABLE2_SCALE.box_mm(1.0, 1.0) * (40.0, 30.0, 4.0), TABLE2_SCALE.box_mm(0.02, 0.05)
+    right, wrong, trials = 0, 0, 40
+    for _ in range(trials):
+        start = rng.uniform(-0.5 * box, 0.5 * box - (1.1, 0.0, 0.0), (count, 3))
+        end = start + (1.1, 0.3, 0.2) + 0.05 * start[:, ::-1]
+        others = rng.uniform(-0.5 * box, 0.5 * box, (2, -(-count // 2), 3))
+        frames = [np.concatenate([at, other]) for at, other in zip((start, end), others, strict=True)]
+        covariance = np.tile([*sigma**2, 0.0, 0.0, 0.0], (len(frames[0]), 1))
+        links = track(*(Seen(at + rng.normal(0.0, sigma, at.shape), covariance) for at in frames), TABLE2_SCALE)
+        is_right = (links.first == links.second) & (links.first < count)
+        right, wrong = right + int(is_right.sum()), wrong + int((~is_right).sum())
+    assert right >= least * count * trials
+    # in six frames of forty a stranger is as near as few are by chance; of many, it lies where a lost one is expected
+    assert wrong <= max(0.15 * trials, 0.04 * right)
+
+
 def test_regions_that_share_no_tracers_have_no_displacement_in_common(rng: np.random.Generator) -> None:
     box = TABLE2_SCALE.box_mm(50.0, 3.0)
     first, second = (rng.uniform(0.0, box, (900, 3)) for _ in range(2))

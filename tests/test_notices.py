@@ -330,14 +330,16 @@ def test_one_image_twice_and_few_links_are_told() -> None:
 
     assert [notice.code for notice in still_notices(tracks(1e-6), "a")] == ["frames-alike"]
     assert still_notices(tracks(1e-3), "a") == []
-    for counts, linked, codes in (
-        ((60, 50), 40, []),
-        ((60, 50), 20, ["few-links"]),
-        ((5, 5), 3, ["few-particles"]),
-        ((7, 5), 2, ["few-particles", "few-links"]),
-        ((3, 3), 1, ["few-particles"]),
+    for counts, staying, linked, codes in (
+        ((60, 50), 50, 40, []),
+        ((60, 50), 50, 20, ["few-links"]),
+        # the others leave the view, as far as they move
+        ((60, 50), 30, 20, []),
+        ((5, 5), 5, 3, ["few-particles"]),
+        ((7, 5), 5, 2, ["few-particles", "few-links"]),
+        ((3, 3), 3, 1, ["few-particles"]),
     ):
-        summary = {"tracks": linked, "expected_wrong_links": 0.0}
+        summary = {"tracks": linked, "expected_wrong_links": 0.0, "particles_staying": staying}
         assert [notice.code for notice in few_notices(counts, ("a", "b"), summary, tracks(1e-3))] == codes
 
 

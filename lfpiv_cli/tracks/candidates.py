@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 import numpy as np
+from scipy import special
 from scipy.ndimage import gaussian_filter, gaussian_filter1d
 from scipy.spatial import KDTree
 
@@ -257,18 +258,18 @@ def candidates_of(first: Seen, second: Seen, middle_mm: Floats, share: Floats, r
 
 # A region holds half as many particles to this many: of more the displacements differ, fewer do not stand out.
 REGION = 250
-# Displacements are looked at up to this, in microlenses in the scene.
-FURTHEST_LENSES = 25.0
+# Displacements are looked at up to this, in microlenses in the scene, and no less far in depth units along the axis.
+FURTHEST_LENSES, FURTHEST_DEPTHS = 25.0, 1.5
 # They are counted in cells of this size, laterally in microlenses and in depth units, and summed by Gaussians whose
 # standard deviations are these: displacements of a region differ, and depths have errors. Their surroundings are summed
 # by Gaussians so many times as wide.
 CELL_LENSES, CELL_DEPTHS = 1.5, 0.15
-SUMMED_LENSES, SUMMED_DEPTHS, SURROUNDINGS = (1.0, 2.0), 0.1, 2.5
-# What stands out by so many standard deviations and holds this share of the region: between clouds that have nothing in
-# common the largest was 4 to 7; partners made 10 to 45.
-LEAST_SIGMAS, LEAST_TOGETHER = 7.0, 0.15
-# With less overlap chance is not known; a Gaussian narrower than this, in cells, is one cell.
-LEAST_OVERLAP, LEAST_CELLS = 0.01, 0.4
+SUMMED_LENSES, SUMMED_DEPTHS, SURROUNDINGS = (0.7, 1.4, 2.8), 0.1, 2.5
+# What stands out explains its pairs by so many units of the logarithm of the likelihood better than chance, which made
+# 11 at most between clouds that have nothing in common, and holds this share of the region.
+LEAST_LIKELIER, LEAST_TOGETHER = 12.0, 0.1
+# With less overlap chance is not known, nor with fewer pairs; a Gaussian narrower than this, in cells, is one cell.
+LEAST_OVERLAP, LEAST_PAIRS, LEAST_CELLS = 0.01, 1e-3, 0.4
 
 
 def common_displacements(first_mm: Floats, second_mm: Floats, scale: Scale) -> Floats:
@@ -280,7 +281,8 @@ def common_displacements(first_mm: Floats, second_mm: Floats, scale: Scale) -> F
     """
     found, unit = np.full(first_mm.shape, np.nan), scale.box_mm(1.0, 1.0)
     cell = np.maximum(CELL_LENSES * unit[0], (0.0, 0.0, CELL_DEPTHS * unit[2]))
-    half = np.ceil(FURTHEST_LENSES * unit[0] / cell).astype(np.int64)
+    furthest = np.maximum(FURTHEST_LENSES * unit[0], (0.0, 0.0, FURTHEST_DEPTHS * unit[2]))
+    half = np.ceil(furthest / cell).astype(np.int64)
     low, high = second_mm.min(axis=0), second_mm.max(axis=0)
     regions = [np.arange(len(first_mm))]
     while regions:
@@ -301,20 +303,23 @@ def common_displacements(first_mm: Floats, second_mm: Floats, scale: Scale) -> F
         moved = [at[:, k, np.newaxis] + cell[k] * np.arange(-half[k], half[k] + 1) for k in range(3)]
         stay = [np.mean((each >= low[k]) & (each <= high[k]), axis=0) for k, each in enumerate(moved)]
         overlap = np.einsum("i,j,k->ijk", *stay).astype(np.float32)
-        best = LEAST_SIGMAS
+        best = LEAST_LIKELIER
         for lenses in SUMMED_LENSES:
             sigma = np.hypot(lenses * unit[0], (0.0, 0.0, SUMMED_DEPTHS * unit[2])) / cell
-            sums, room = (gaussian_filter(each, sigma, mode="nearest") for each in (pairs, overlap))
-            around = [gaussian_filter(each, SURROUNDINGS * sigma, mode="nearest") for each in (pairs, overlap)]
+            sums, room = (gaussian_filter(each, sigma, mode="constant") for each in (pairs, overlap))
+            around = [gaussian_filter(each, SURROUNDINGS * sigma, mode="constant") for each in (pairs, overlap)]
             by_chance = around[0] / np.maximum(around[1], LEAST_OVERLAP) * room
-            # A sum of weights w has the variance of its counts times the sum of w^2; one pair at least is expected.
+            # Pairs that a sum of weights w counts as: the sum of w over the sum of w^2.
             cells = np.prod(2.0 * np.sqrt(np.pi) * np.maximum(sigma, LEAST_CELLS))
-            sigmas = (sums - by_chance) / np.sqrt((by_chance + 1.0 / cells) / cells)
-            place = int(np.argmax(sigmas))
+            chance = np.maximum(cells * by_chance, LEAST_PAIRS)
+            likelier = special.xlogy(cells * sums, cells * sums / chance) - (cells * sums - chance)
+            # Pairs that share particles come together.
+            likelier /= 1.0 + chance / len(region)
+            place = int(np.argmax(np.where(sums > by_chance, likelier, 0.0)))
             held = float((sums - by_chance).flat[place]) * np.prod(np.sqrt(2.0 * np.pi) * sigma)
-            if sigmas.flat[place] > best and held > LEAST_TOGETHER * len(region):
-                best = float(sigmas.flat[place])
-                found[region] = (np.array(np.unravel_index(place, sigmas.shape)) - half) * cell
+            if likelier.flat[place] > best and held > LEAST_TOGETHER * len(region):
+                best = float(likelier.flat[place])
+                found[region] = (np.array(np.unravel_index(place, likelier.shape)) - half) * cell
     return found
 
 

@@ -183,6 +183,12 @@ FURTHEST_SIGMAS = 12.0
 WRONG_LENSES = 0.3
 # A link is kept that is more likely than all its alternatives together.
 LEAST_PROBABILITY = 0.5
+# Links are of one motion where the logarithms of their odds against chance, each by what the others let expect, sum up
+# to the first, or come to the second for each of the links of more than half of the particles. In unrelated images they
+# came to 53 at most, and to 2.5.
+SURE_ODDS, SURE_ODDS_EACH = 60.0, 2.7
+# A link that no other bears out is kept where fewer particles than this are as near by chance.
+MOST_BY_CHANCE = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,11 +199,13 @@ class Tracks:
     ----------
     first, second : (n,) numbers of the particles in the two frames
     probability : (n,) of the links, from the alternatives
+    log_odds : sum of the logarithms of the links' odds against chance, each by what the others let expect
     """
 
     first: Integers
     second: Integers
     probability: Floats
+    log_odds: float = 0.0
 
 
 NO_TRACKS = Tracks(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0))
@@ -238,16 +246,37 @@ def track(
 ) -> Tracks:
     """Link two frames' particles, whose displacements are at most `search_mm` unless forecast; None: any length.
 
-    Any number of particles will do; one alone is linked where there is one candidate.
+    Any number of particles will do; one alone is linked where there is one candidate. Where neither is given, links are
+    kept that are of one motion beyond chance, or so short that chance makes few.
     """
     if not len(first) or not len(second):
         return NO_TRACKS
     reach = reach_of(scale, search_mm)
     reach *= min(1.0, MOST_CANDIDATES / _candidates_each(first, second, reach)) ** (1.0 / 3.0)
     links = _linked_about(np.zeros(first.position_mm.shape), first, second, reach, scale, forecast)
-    if search_mm is not None or forecast is not None or len(first) <= NEIGHBOURS:
+    if search_mm is not None or forecast is not None:
         return links
-    return _sought_further(links, first, second, reach, scale)
+    if len(first) > NEIGHBOURS:
+        links = _sought_further(links, first, second, reach, scale)
+    if _of_one_motion(links, first, second):
+        return links
+    shown = np.nan_to_num(common_displacements(first.position_mm, second.position_mm, scale))
+    far = _linked_about(shown, first, second, SURE_REACH * reach, scale)
+    return far if _of_one_motion(far, first, second) else _nearest(links, first, second, reach)
+
+
+def _of_one_motion(links: Tracks, first: Seen, second: Seen) -> bool:
+    """Return whether links agree better than chance makes them."""
+    count, most = len(links.first), min(len(first), len(second))
+    return links.log_odds > min(SURE_ODDS, SURE_ODDS_EACH * count if 2 * count > most else SURE_ODDS)
+
+
+def _nearest(links: Tracks, first: Seen, second: Seen, reach: Floats) -> Tracks:
+    """Return those links that are so short, beside a reach (3,), that chance makes few."""
+    off = (second.position_mm[links.second] - first.position_mm[links.first]) / reach
+    by_chance = np.linalg.norm(off, axis=1) ** 3 * _candidates_each(first, second, reach)
+    kept = by_chance < MOST_BY_CHANCE
+    return Tracks(links.first[kept], links.second[kept], (links.probability * np.exp(-by_chance))[kept])
 
 
 def reach_of(scale: Scale, search_mm: float | None = None) -> Floats:
@@ -342,17 +371,17 @@ def _linked_about(
     best = best[np.isfinite(score[best])]
     order = best[np.argsort(-score[best], kind="stable")]
     links, share = np.sort(order[np.unique(candidates.second[order], return_index=True)[1]]), PARTNERED
-    probability = np.zeros(len(candidates.first))
     for _ in range(ROUNDS):
         known = known_of(first, second, candidates.first[links], candidates.second[links], scale)
         expected = expected_of(first.position_mm, known, reach, scale, forecast)
         expected = _calibrated(expected, known)
-        probability = probability_of(candidates, expected, first, second, share, density)
+        probability, odds = probability_of(candidates, expected, first, second, share, density)
         share = float(np.clip(probability.sum() / len(first), LEAST_PARTNERED, MOST_PARTNERED))
         before, links = links, np.flatnonzero(probability > LEAST_PROBABILITY)
         if len(np.setxor1d(before, links)) <= SETTLED_SHARE * len(links):
             break
-    return Tracks(candidates.first[links], candidates.second[links], probability[links])
+    log_odds = float(np.log(odds[links]).sum())
+    return Tracks(candidates.first[links], candidates.second[links], probability[links], log_odds)
 
 
 def link_some(
@@ -372,7 +401,7 @@ def link_some(
     candidates = candidates.part(some[candidates.first] & free[candidates.second])
     expected = _calibrated(expected_of(start.position_mm, known, reach, scale, forecast), known)
     density = density_per_mm3(start, end, reach)
-    probability = probability_of(candidates, expected, start, end, PARTNERED, density)
+    probability = probability_of(candidates, expected, start, end, PARTNERED, density)[0]
     links = np.flatnonzero(probability > LEAST_PROBABILITY)
     return Tracks(candidates.first[links], candidates.second[links], probability[links])
 
@@ -417,8 +446,8 @@ def expected_of(
 
 def probability_of(
     candidates: Candidates, expected: Expected, first: Seen, second: Seen, share: float, density: float
-) -> Floats:
-    """Return the probability (c,) that pairs are one particle.
+) -> tuple[Floats, Floats]:
+    """Return the probability (c,) that pairs are one particle, and their odds (c,) against chance.
 
     Parameters
     ----------
@@ -435,10 +464,11 @@ def probability_of(
         (1.0 - TAIL_SHARE) * np.exp(-0.5 * distance2)
         + TAIL_SHARE * np.exp(-0.5 * distance2 / TAIL_WIDTH**2) / TAIL_WIDTH**3
     )
-    odds = share / (1.0 - share) * likely * candidates.light_ratio[near] / density
-    probability = np.zeros(len(off))
-    probability[near] = marginals(candidates.first[near], candidates.second[near], odds, (len(first), len(second)))
-    return probability
+    probability, odds = np.zeros(len(off)), np.zeros(len(off))
+    odds[near] = likely * candidates.light_ratio[near] / density
+    sizes, all_odds = (len(first), len(second)), share / (1.0 - share) * odds[near]
+    probability[near] = marginals(candidates.first[near], candidates.second[near], all_odds, sizes)
+    return probability, odds
 
 
 def density_per_mm3(first: Seen, second: Seen, reach: Floats) -> float:

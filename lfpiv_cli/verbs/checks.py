@@ -260,14 +260,14 @@ def few_notices(
         text = f"{fullest} particles at most in a frame: below {FEW} neighbours do not tell wrong links"
         remedy = "judge the links by themselves, or find more particles"
         notices.append(Notice("few-particles", names[0], text, remedy, float(fullest), f"at least {FEW}"))
-    linked, fewest = summary["tracks"], min(counts)
+    linked, fewest = summary["tracks"], summary.get("particles_staying", min(counts))
     if len(counts) == 2 and fewest >= FEWEST_TO_LINK and 0 < linked < LEAST_LINKED * fewest:
-        text = f"{linked} of {fewest} particles have a partner in the other frame, as many as in unrelated images"
+        text = f"{linked} of {fewest} particles that stay in view have a partner, as many as in unrelated images"
         remedy = "check that both images are of one pair, the time between them, and how far is sought (--search)"
         notices.append(Notice("few-links", names[0], text, remedy, linked / fewest, f"at least {LEAST_LINKED:g}"))
     if not linked:
-        text = "no tracks were found from it to the next frame"
-        remedy = "check the order of the frames and how far particles are sought (--search)"
+        text = "no tracks to the next frame: particles have no motion in common beyond chance, nor partners close by"
+        remedy = "check the order of the frames; a shorter time between them, or say how far tracers move (--search)"
         notices.append(Notice("no-tracks", names[0], text, remedy, 0.0, "some"))
     return notices + doubt_notices(summary, names[0]) + still_notices(tracks, names[0])
 

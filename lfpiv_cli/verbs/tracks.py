@@ -313,6 +313,11 @@ def tracked(
         "expected_wrong_links": float(np.sum(1.0 - links.probability)),
     }
     if len(links.first):
+        # Of those that the links' motion takes to where the other frame has particles.
+        moved = np.median(path.displacement_mm, axis=0)
+        places = ((first.position_mm + moved, second.position_mm), (second.position_mm - moved, first.position_mm))
+        staying = [np.all((at >= to.min(axis=0)) & (at <= to.max(axis=0)), axis=1).sum() for at, to in places]
+        summary["particles_staying"] = int(min(staying))
         before, after = first.arrays["intensity"][links.first], second.arrays["intensity"][links.second]
         summary["light_b_over_a"] = float(np.median(after / before))
     points = Points(path.middle_mm, arrays, reference, reported, provenance)
