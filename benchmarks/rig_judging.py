@@ -48,6 +48,7 @@ class Truth:
     ----------
     position_mm : (n, 3)
     inside : (n,) which lie in the volume
+    stays : (n,) which lie there in the second image, too
     bound : of their places
     light_over_sigma : (n,) of each alone
     flow : velocities in m/s at points in these coordinates
@@ -55,6 +56,7 @@ class Truth:
 
     position_mm: NDArray[np.float64]
     inside: NDArray[np.bool_]
+    stays: NDArray[np.bool_]
     bound: Bound
     light_over_sigma: NDArray[np.float64]
     flow: Flow
@@ -84,12 +86,15 @@ def truth_of(settings: Config, images: Path, grid: Grid) -> Truth:
     slope = slopes(view, tracers)
     per_ray = scene.particle_counts / (scene.rays or RAYS)
     bound = cramer_rao_bound(slope, pixel_variance(expected_image(slope, tracers), readout_of(settings), per_ray))
+    later = advect(settings.simulated_flow(reference), seeded.positions_mm, 0.5 * DT_S)
     position = reference.points_from_focal_point(moved)
-    bounds = np.array([grid.bounds_mm(axis) for axis in range(3)])
-    inside = np.all((position >= bounds[:, 0]) & (position <= bounds[:, 1]), axis=1)
+    low, high = np.array([grid.bounds_mm(axis) for axis in range(3)]).T
+    inside, stays = (
+        np.all((at >= low) & (at <= high), axis=1) for at in (position, reference.points_from_focal_point(later))
+    )
     with np.errstate(invalid="ignore"):
         certainty = light / np.sqrt(bound.alone[:, 3, 3])
-    return Truth(position, inside, bound, certainty, settings.simulated_flow())
+    return Truth(position, inside, inside & stays, bound, certainty, settings.simulated_flow())
 
 
 def judge_particles(rig: DrawnRig, truth: Truth, particles: Path) -> Figures:
@@ -108,6 +113,7 @@ def judge_particles(rig: DrawnRig, truth: Truth, particles: Path) -> Figures:
     offset = np.median(coarse.error_voxel * WIDER, axis=0) if len(coarse.found) else np.zeros(3)
     pairs = match(here - offset, there, 1.0)
     figures["recall"] = float(truth.inside[pairs.true].sum() / truth.inside.sum())
+    figures["staying"] = float(truth.stays[pairs.true].sum())
     own = found.arrays["flag"] == 0
     figures["precision"] = float(own[pairs.found].sum() / max(own.sum(), 1))
     for axis, name in enumerate(AXES):

@@ -324,8 +324,9 @@ def faults(figures: Figures) -> list[str]:
         if slope is not None and abs(slope - 1.0) > WRONG_SLOPE + 2.0 * figures[f"slope_{name}_sigma"]:
             wrong.append(f"slope {name} {slope:.3f}")
     judged = figures.get("recall", 0.0) * figures.get("tracers", 0.0)
-    if figures.get("tracks", judged) < SMALLEST_TRACKED * judged:
-        wrong.append(f"{figures['tracks']:.0f} tracks of {judged:.0f} tracers found")
+    staying = figures.get("staying", judged)
+    if figures.get("tracks", staying) < SMALLEST_TRACKED * staying:
+        wrong.append(f"{figures['tracks']:.0f} tracks of {staying:.0f} tracers found that stay")
     for name in "xyz":
         coverage = figures.get(f"coverage_{name}", 1.0)
         if judged >= FEWEST and coverage < SMALLEST_COVERAGE:
@@ -338,7 +339,9 @@ def verdict(outcome: Outcome) -> str:
     failed = [step for step in outcome.steps if step.exit_code]
     if failed:
         bug = failed[0].exit_code == 1
-        return "refused" if failed[0].command in BEFORE_THE_WORK and not bug else "failed"
+        # Of an image that shows none, as it is said of it, nothing can be followed.
+        empty = failed[0].command == "track" and "no-particles" in codes(outcome.steps)
+        return "refused" if (failed[0].command in BEFORE_THE_WORK or empty) and not bug else "failed"
     if not outcome.faults:
         return "worked"
     # Nothing is stated that is wrong where no track was found.
