@@ -4,8 +4,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.files.batch import Frame
 from lfpiv_cli.grid import Scale
 from lfpiv_cli.optics.camera import Camera
@@ -50,7 +50,7 @@ BESIDE = np.array([0.03, -0.02, 0.2, 0.0])
 
 
 @pytest.fixture(scope="module")
-def true() -> NDArray[np.float64]:
+def true() -> Floats:
     """Return particles; the last has come in beside the first, an overlapping one."""
     places = np.random.default_rng(3).uniform((-1.0, -0.8, 1.0, 4e5), (1.0, 0.8, 2.8, 6e5), (45, 4))
     places[-1] = places[0] + BESIDE
@@ -58,11 +58,11 @@ def true() -> NDArray[np.float64]:
 
 
 @pytest.fixture(scope="module")
-def task(table2: Camera, water: Media, true: NDArray[np.float64]) -> Task:
+def task(table2: Camera, water: Media, true: Floats) -> Task:
     return task_with(table2, water, true, np.random.default_rng(4))
 
 
-def predicted(particles: NDArray[np.float64], seed: int = 5) -> Predicted:
+def predicted(particles: Floats, seed: int = 5) -> Predicted:
     """Return particles as tracks predict them: off by what they state."""
     noise = np.random.default_rng(seed).normal(size=particles.shape)
     off = particles + noise * PREDICTION_OFF * np.column_stack([np.ones((len(particles), 3)), particles[:, 3]])
@@ -71,9 +71,7 @@ def predicted(particles: NDArray[np.float64], seed: int = 5) -> Predicted:
 
 
 @pytest.mark.thorough
-def test_what_is_predicted_and_the_rest_are_found_and_what_is_not_there_goes(
-    task: Task, true: NDArray[np.float64]
-) -> None:
+def test_what_is_predicted_and_the_rest_are_found_and_what_is_not_there_goes(task: Task, true: Floats) -> None:
     gone = np.random.default_rng(6).uniform((-0.9, -0.7, 1.2, 4e5), (0.9, 0.7, 2.6, 6e5), (4, 4))
     assert not found(true, gone).any()
     for expected in (true[NEW:-1], np.concatenate([true, gone])):
@@ -85,7 +83,7 @@ def test_what_is_predicted_and_the_rest_are_found_and_what_is_not_there_goes(
     assert found(state.particles, true[[0, -1]]).all()
 
 
-def test_predictions_that_fit_nothing_are_refused(task: Task, true: NDArray[np.float64]) -> None:
+def test_predictions_that_fit_nothing_are_refused(task: Task, true: Floats) -> None:
     elsewhere = np.random.default_rng(7).uniform((-1.0, -0.8, 1.0, 4e5), (1.0, 0.8, 2.8, 6e5), (45, 4))
     assert find_predicted(task, predicted(elsewhere)) is None
     # Nor is there anything to go on from where none is expected, or none within the volume's depths.
@@ -96,7 +94,7 @@ def test_predictions_that_fit_nothing_are_refused(task: Task, true: NDArray[np.f
 SCALE = Scale(0.1, 1.064)
 
 
-def strewn(rng: np.random.Generator, count: int = 30) -> NDArray[np.float64]:
+def strewn(rng: np.random.Generator, count: int = 30) -> Floats:
     return rng.uniform((-0.9, -0.7, 1.2, 4e5), (0.9, 0.7, 2.6, 6e5), (count, 4))
 
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import yaml
 from click.testing import CliRunner
-from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.cli.main import cli
 from lfpiv_cli.errors import LimitMissedError
 from lfpiv_cli.files.vtkhdf import write_vectors
@@ -25,7 +25,6 @@ from lfpiv_cli.paper.sensitivities import INFLUENCES, Measured, care, crowding, 
 from lfpiv_cli.paper.small_rig import CHANNEL, WATER, Case, Rig, displacement
 from lfpiv_cli.validation.volume import TERMS, fit_errors, pairs_of
 
-Points = NDArray[np.float64]
 # Of places and displacements, x, y and z, mm.
 SIGMA_MM = np.array([1e-4, 1e-4, 3e-3])
 
@@ -147,17 +146,17 @@ DEPTHS = np.array([-3.0, 0.0, 4.0])
 FAINT = 1e-4
 
 
-def places(count: int = 40) -> NDArray[np.float64]:
+def places(count: int = 40) -> Floats:
     return np.random.default_rng(0).uniform(-1.0, 1.0, (count, 3)) * [1.0, 1.0, 4.0]
 
 
-def apparent_mm(rig: Rig, z_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+def apparent_mm(rig: Rig, z_mm: Floats) -> Floats:
     """Where paraxial rays see depths from the mid plane, from the lens."""
     depths = rig.reference.depth_to_focal_point(0.0) + z_mm
     return equivalent_object_distance(depths, rig.camera.focus_distance_mm, rig.media)
 
 
-def believed_depth_mm(case: Case, z_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+def believed_depth_mm(case: Case, z_mm: Floats) -> Floats:
     """The depths, from the believed mid plane, at which paraxial rays from true ones are seen."""
     seen = apparent_mm(case.true, z_mm) - case.true.camera.focus_distance_mm
     return np.asarray(seen / case.believed.media.depth_ratio - case.believed.reference.z_mm)
@@ -189,7 +188,7 @@ def by_theory(influence: Influence, factor: float = 1.0) -> Measured:
         ("twist", lambda p: 0.3 * p[:, 2:] * np.column_stack([-p[:, 1], p[:, 0], 0.0 * p[:, 0]])),
     ],
 )
-def test_the_map_names_each_displacement(name: str, error: Callable[[NDArray[np.float64]], NDArray[np.float64]]):
+def test_the_map_names_each_displacement(name: str, error: Callable[[Floats], Floats]):
     true = places()
     figures = fit_errors(true, error(true)).figures
     assert figures.pop(name) == pytest.approx(0.3, abs=1e-12)

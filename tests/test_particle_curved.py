@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.optics.camera import Camera, Lattice
 from lfpiv_cli.optics.curved_space import CurvedSpace, Face
@@ -40,7 +40,7 @@ def view(camera: Camera, water: Media) -> View:
     return raw_view(camera, water, RADIUS_MM, space=tube_of(water))
 
 
-def images(view: View, point: NDArray[np.float64]) -> NDArray[np.float64]:
+def images(view: View, point: Floats) -> Floats:
     """Return light and derivatives as images (pixels, 4)."""
     responses = room_for(1, entry_capacity(view, *DEPTHS), 0)
     respond_all(view, np.array([[*point, 1.0]]), responses)
@@ -50,7 +50,7 @@ def images(view: View, point: NDArray[np.float64]) -> NDArray[np.float64]:
     return result
 
 
-def counted(camera: Camera, space: CurvedSpace, point: tuple[float, float, float], rays: int) -> NDArray[np.float64]:
+def counted(camera: Camera, space: CurvedSpace, point: tuple[float, float, float], rays: int) -> Floats:
     """Return the share of the rays of a glowing ball that strike each pixel, traced one by one."""
     rng = np.random.default_rng(1)
     away = rng.normal(size=(rays, 3))

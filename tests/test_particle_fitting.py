@@ -6,9 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numba import typeof, types
-from numpy.typing import NDArray
 from scipy.signal import lfilter
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.optics.camera import Camera, Lattice
 from lfpiv_cli.optics.media import Media
 from lfpiv_cli.particles.covariance import joint_covariance
@@ -30,24 +30,24 @@ def view(table2: Camera, water: Media) -> View:
     return raw_view(replace(table2, lattice=lattice, columns=700, rows=600), water, 0.025)
 
 
-def image_of(view: View, particles: NDArray[np.float64]) -> NDArray[np.float64]:
+def image_of(view: View, particles: Floats) -> Floats:
     return light_on(view, particles, DEPTHS)
 
 
-def observed(view: View, residual: NDArray[np.float64], weight: NDArray[np.float64]) -> Observation:
+def observed(view: View, residual: Floats, weight: Floats) -> Observation:
     return observation_of(view, residual, weight, DEPTHS)
 
 
 def stated(
-    view: View, particles: NDArray[np.float64], correlation: Correlation = WHITE, worse: float = 1.0, *shared: object
-) -> NDArray[np.float64]:
+    view: View, particles: Floats, correlation: Correlation = WHITE, worse: float = 1.0, *shared: object
+) -> Floats:
     """Return covariances of particles in an image of their own light."""
     weight = 1.0 / (image_of(view, particles) + 36.0)
     blind = observed(view, np.zeros_like(weight), weight)
     return joint_covariance(blind, particles, correlation, np.full(len(particles), worse), *shared)
 
 
-def slopes_of(view: View, particles: NDArray[np.float64]) -> NDArray[np.float64]:
+def slopes_of(view: View, particles: Floats) -> Floats:
     """Return the image's changes by all unknowns, one after the other, by differences."""
     slopes = []
     for number, unknown in np.ndindex(particles.shape):
@@ -57,7 +57,7 @@ def slopes_of(view: View, particles: NDArray[np.float64]) -> NDArray[np.float64]
     return np.array(slopes)
 
 
-def scattered(count: int, rng: np.random.Generator) -> NDArray[np.float64]:
+def scattered(count: int, rng: np.random.Generator) -> Floats:
     low, high = (-1.4, -1.2, -3.5, 4e5), (1.4, 1.2, 3.5, 6e5)
     return rng.uniform(low, high, (count, 4))
 
@@ -93,7 +93,7 @@ def test_image_and_what_is_expected_count_by_their_errors(view: View, rng: np.ra
     sigma = np.array([6e-4, 3e-4, 4e-3, np.inf])
     prior = np.concatenate([particle[0] + np.array([1e-3, -5e-4, 8e-3, 0.0]), 1.0 / sigma**2])[np.newaxis]
 
-    def fitted(prior: NDArray[np.float64] | None) -> NDArray[np.float64]:
+    def fitted(prior: Floats | None) -> Floats:
         at, residual = particle.copy(), noise.copy()
         for _ in range(3):
             refine(observed(view, residual, weight), at, 1e-6, prior=prior)
@@ -354,7 +354,7 @@ def small_view(table2: Camera, water: Media) -> View:
     return raw_view(replace(table2, columns=460, rows=420), water, 0.025)
 
 
-def picture(view: View, particles: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.float64]:
+def picture(view: View, particles: Floats, rng: np.random.Generator) -> Floats:
     """The light of particles with the noise that is stated for it."""
     image = image_of(view, particles)
     return image + rng.normal(0.0, np.sqrt(NOISE.read_counts**2 + NOISE.gain_counts * image))

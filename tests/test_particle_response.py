@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.names import Layout
 from lfpiv_cli.optics.camera import Camera, Lattice
 from lfpiv_cli.optics.media import Media, Window, exact_lateral_mm
@@ -37,7 +37,7 @@ def view(small: Camera, water: Media) -> View:
     return raw_view(small, water, RADIUS_MM)
 
 
-def images(view: View, point: tuple[float, float, float]) -> NDArray[np.float64]:
+def images(view: View, point: tuple[float, float, float]) -> Floats:
     """Return light and derivatives as images (pixels, 4)."""
     capacity = entry_capacity(view, -5.0, 5.0)
     pixels, values = np.empty(capacity, np.int32), np.empty((capacity, 4))

@@ -5,9 +5,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.grid import Grid, Scale
 from lfpiv_cli.names import ColumnAxis, Layout
 from lfpiv_cli.optics.camera import Camera, Lattice
@@ -120,7 +120,7 @@ def test_a_single_tracer_is_found_in_a_volume_that_is_partly_out_of_view(
     np.testing.assert_allclose(state.particles, true, rtol=0.02, atol=2e-3)
 
 
-def with_noise(light: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.float64]:
+def with_noise(light: Floats, rng: np.random.Generator) -> Floats:
     return rng.poisson(0.5 * light) / 0.5 + rng.normal(0.0, 6.0, light.shape)
 
 
@@ -140,7 +140,7 @@ def test_any_brightness_will_do(
     water: Media,
     rng: np.random.Generator,
     counts: float,
-    recorded: Callable[[NDArray[np.float64], np.random.Generator], NDArray[np.float64]],
+    recorded: Callable[[Floats, np.random.Generator], Floats],
 ) -> None:
     camera = replace(table2, columns=240, rows=240)
     weights = weights_of(camera, water, Grid.centred((12, 12, 12), (0.1, 0.1, 0.1), (0.0, 0.0, 1.9)))

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.files.config import load_rig
 from lfpiv_cli.files.vtkhdf import write_vectors
 from lfpiv_cli.flow.field import MASKED, REJECTED, VALID, VectorField
@@ -206,7 +206,7 @@ def image_of(axes) -> np.ndarray:
     return np.ma.filled(axes.images[0].get_array().astype(float), np.nan)
 
 
-def test_planes_have_arrows_in_them_and_the_component_across_on_one_scale(field: NDArray[np.float64]) -> None:
+def test_planes_have_arrows_in_them_and_the_component_across_on_one_scale(field: Floats) -> None:
     figure = pictures.planes_figure(field)
     first, second, third = panels(figure)
     assert [axes.get_title() for axes in (first, second, third)] == [
@@ -230,7 +230,7 @@ def test_planes_have_arrows_in_them_and_the_component_across_on_one_scale(field:
     assert key.text.get_text() == "0.3 m/s"
 
 
-def test_slow_flows_are_told_in_mm_per_s_and_gradients_show_the_turn(field: NDArray[np.float64]) -> None:
+def test_slow_flows_are_told_in_mm_per_s_and_gradients_show_the_turn(field: Floats) -> None:
     slow = pictures.shown(replace(field, dt_s=0.1))
     assert slow.unit == "mm/s"
     np.testing.assert_allclose(slow.values[2, 1, 1], field.displacement_voxel[2, 1, 1])
@@ -249,7 +249,7 @@ def test_slow_flows_are_told_in_mm_per_s_and_gradients_show_the_turn(field: NDAr
         pictures.gradients_figure(replace(field, dt_s=None))
 
 
-def test_components_and_sigma_have_one_scale_and_flags_are_counted(field: NDArray[np.float64]) -> None:
+def test_components_and_sigma_have_one_scale_and_flags_are_counted(field: Floats) -> None:
     figure = pictures.components_figure(field)
     rows = np.array(panels(figure)).reshape(3, 3)
     np.testing.assert_array_equal(image_of(rows[1, 2]), field.velocity[:, :, 1, 1])
@@ -280,7 +280,7 @@ def test_components_and_sigma_have_one_scale_and_flags_are_counted(field: NDArra
 
 
 @pytest.mark.thorough
-def test_displacements_show_their_parts_beyond_whole_voxels_and_microlenses(field: NDArray[np.float64]) -> None:
+def test_displacements_show_their_parts_beyond_whole_voxels_and_microlenses(field: Floats) -> None:
     axes = np.array(pictures.displacements_figure(field, lens_mm=0.4).axes).reshape(3, 3)
     valid = field.displacement_voxel[field.flag == VALID]
     for row, size in ((1, 1.0), (2, 4.0)):
@@ -292,7 +292,7 @@ def test_displacements_show_their_parts_beyond_whole_voxels_and_microlenses(fiel
 
 
 @pytest.mark.thorough
-def test_figures_of_a_file_follow_what_it_knows(field: NDArray[np.float64], tmp_path: Path) -> None:
+def test_figures_of_a_file_follow_what_it_knows(field: Floats, tmp_path: Path) -> None:
     path = tmp_path / "vectors.vtkhdf"
     varied = replace(field, correlation=np.linspace(0.2, 0.9, 60).reshape(SHAPE))
     write_vectors(path, varied, AT_FOCUS, provenance={}, overwrite=True)
@@ -334,7 +334,7 @@ def test_colours_are_about_zero_where_there_are_both_signs_and_begin_at_the_leas
         assert scale_of(flat)["vmax"] > scale_of(flat)["vmin"]
 
 
-def test_bars_of_colours_are_as_high_as_their_panels(field: NDArray[np.float64]) -> None:
+def test_bars_of_colours_are_as_high_as_their_panels(field: Floats) -> None:
     figure = pictures.components_figure(field)
     figure.draw_without_rendering()
     bars = [(axes, bar) for axes in figure.axes for bar in axes.child_axes]

@@ -10,6 +10,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.calibration.lattice import LatticeFit, fit_lattice
 from lfpiv_cli.calibration.rectification import EXPONENT_ARRAY, Rectification, sample_rows, turn_matrix, write_shift
 from lfpiv_cli.calibration.shape_fit import lens_crossings, pixel_rays
@@ -28,7 +29,7 @@ SHAPE = (120, 150)
 CENTRE = np.array([(SHAPE[1] - 1) / 2, (SHAPE[0] - 1) / 2])
 
 
-def known_fit(lattice: Lattice, cubic: NDArray[np.float64] | None = None) -> LatticeFit:
+def known_fit(lattice: Lattice, cubic: Floats | None = None) -> LatticeFit:
     """A fit that is exactly `lattice`, or `lattice` plus cubic terms."""
     coefficients = np.zeros((10, 2))
     coefficients[0], coefficients[1:3] = lattice.origin, lattice.basis
@@ -180,7 +181,7 @@ def small(camera: Camera) -> Camera:
 
 
 @pytest.fixture
-def image(small: Camera, water: Media, rng: np.random.Generator) -> NDArray[np.float64]:
+def image(small: Camera, water: Media, rng: np.random.Generator) -> Floats:
     """A small glowing disc, as wide as a microlens."""
     start = np.column_stack([disc_points(RAYS, 0.05, rng), np.zeros(RAYS)]) + POINT
     return points_counted(start, small, water, rng)

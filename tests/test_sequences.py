@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Floats, Integers
 from lfpiv_cli.files.particle_file import POSITION
 from lfpiv_cli.grid import Scale
 from lfpiv_cli.synthetic.flows import advect, rigid_rotation, taylor_green
@@ -22,14 +22,14 @@ NOISE_MM = np.array([0.003, 0.003, 0.02])
 BOX_MM, DT_S = 4.0, 0.002
 
 
-def moved(points: NDArray[np.float64]) -> NDArray[np.float64]:
+def moved(points: Floats) -> Floats:
     """Return displacements of a sheared flow that is also turned: up to 0.5 mm, more than the particles' distance."""
     x, y, z = (points - 2.0).T
     return np.stack([0.3 + 0.05 * z, 0.04 * x, -0.1 + 0.03 * y], axis=1)
 
 
 @pytest.fixture
-def frames(rng: np.random.Generator) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def frames(rng: np.random.Generator) -> tuple[Floats, Floats]:
     """Two frames of 500 particles in 64 mm3, a tenth of each frame alone in it; the first 450 belong together."""
     both = rng.uniform(0.0, BOX_MM, (450, 3))
     lone = rng.uniform(0.0, BOX_MM, (2, 50, 3))
@@ -38,7 +38,7 @@ def frames(rng: np.random.Generator) -> tuple[NDArray[np.float64], NDArray[np.fl
 
 
 def test_particles_are_followed_further_than_their_distance_and_few_without_common_ones(
-    frames: tuple[NDArray[np.float64], NDArray[np.float64]], rng: np.random.Generator
+    frames: tuple[Floats, Floats], rng: np.random.Generator
 ) -> None:
     tracks = track(*map(Seen, frames), SCALE, 0.6)
     right = (tracks.first == tracks.second) & (tracks.first < 450)
@@ -71,9 +71,7 @@ def test_few_particles_are_followed_among_ghosts(count: int, rng: np.random.Gene
 
 @pytest.mark.parametrize("factor", [10.0, 0.2])
 @pytest.mark.parametrize("count", [4, 20, 500])
-def test_a_world_of_another_size_has_the_same_links(
-    count: int, factor: float, frames: tuple[NDArray[np.float64], NDArray[np.float64]]
-) -> None:
+def test_a_world_of_another_size_has_the_same_links(count: int, factor: float, frames: tuple[Floats, Floats]) -> None:
     some = slice(max(0, 448 - count), 452)
     first, second = frames[0][some], frames[1][some]
     here = track(Seen(first), Seen(second), SCALE, 0.6)
@@ -86,7 +84,7 @@ def test_a_world_of_another_size_has_the_same_links(
 def test_grid_takes_a_quadratic_flow_exactly_and_has_no_vector_without_tracks(rng: np.random.Generator) -> None:
     points, nodes = rng.uniform(0.0, BOX_MM, (800, 3)), rng.uniform(0.5, 3.5, (20, 3))
 
-    def flow(at: NDArray[np.float64]) -> NDArray[np.float64]:
+    def flow(at: Floats) -> Floats:
         x, y, z = at.T
         return np.stack([1.0 - x**2 + x * z, 0.3 * y + z**2, x * y - y * z], axis=1)
 
@@ -140,11 +138,11 @@ FLOW = rigid_rotation((0.0, 20.0, 0.0), (2.0, 2.0, 2.0), (0.05, 0.0, 0.06))
 class Recorded:
     """Frames of places, and of each place its true one and its true particle, -1 for a ghost."""
 
-    points: list[NDArray[np.float64]]
-    true_mm: list[NDArray[np.float64]]
-    true_number: list[NDArray[np.int64]]
+    points: list[Floats]
+    true_mm: list[Floats]
+    true_number: list[Integers]
 
-    noise_mm: NDArray[np.float64]
+    noise_mm: Floats
 
     @property
     def seen(self) -> list[Seen]:
@@ -154,12 +152,12 @@ class Recorded:
         return follow(self.seen[:frames], 0.4, shortest, SCALE)
 
 
-def seen(points: NDArray[np.float64], noise_mm: NDArray[np.float64] = NOISE_MM) -> Seen:
+def seen(points: Floats, noise_mm: Floats = NOISE_MM) -> Seen:
     """Return places with the covariance of their noise."""
     return Seen(points, np.tile([*noise_mm**2, 0.0, 0.0, 0.0], (len(points), 1)))
 
 
-def lengths_of(tracks: Trajectories) -> NDArray[np.int64]:
+def lengths_of(tracks: Trajectories) -> Integers:
     """Return the length of each place's track, 0 where it is of none."""
     labels = np.concatenate(tracks.labels)
     return np.append(np.bincount(labels[labels != NO_TRACK]), 0)[labels]
@@ -168,7 +166,7 @@ def lengths_of(tracks: Trajectories) -> NDArray[np.int64]:
 def record(rng: np.random.Generator, ghosts: float, noise: float) -> Recorded:
     """Return frames of some 500 particles, a tenth lost in each, and a share of ghosts, elsewhere in every frame."""
     start = rng.uniform(-1.0, BOX_MM + 1.0, (1700, 3))
-    frames: list[tuple[NDArray[np.float64], ...]] = []
+    frames: list[tuple[Floats, ...]] = []
     for number in range(FRAMES):
         places = advect(FLOW, start, number * DT_S)
         inside = np.all((places > 0.0) & (places < BOX_MM), axis=1)
@@ -193,7 +191,7 @@ def followed(recorded: Recorded) -> Trajectories:
     return recorded.follow(FRAMES, 3)
 
 
-def error_over_sigma(recorded: Recorded, found: Trajectories, frames: int) -> NDArray[np.float64]:
+def error_over_sigma(recorded: Recorded, found: Trajectories, frames: int) -> Floats:
     """Return errors of velocity and these over their stated standard errors, (2, n, 3), of what is no ghost."""
     there = recorded.seen[:frames]
     (scatter, half), both = scatter_in(found, there), []

@@ -6,8 +6,8 @@ from time import sleep
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.errors import InputError, UsageError
 from lfpiv_cli.files import listing, shares
 from lfpiv_cli.files.listing import LOOK_S, PASSED_OVER_S, SETTLED_S, as_they_come
@@ -189,7 +189,7 @@ def test_every_piece_of_work_is_shared_out_once() -> None:
     for count, expected in ((0, [(0, 0)]), (1, [(0, 1)]), (4, [(0, 2), (2, 4)]), (5, [(0, 2), (2, 4), (4, 5)])):
         assert [(block.start, block.stop) for block in blocks(count, 2)] == expected
 
-    def work(part: tuple[int, int], much: float, onto: NDArray[np.float64]) -> None:
+    def work(part: tuple[int, int], much: float, onto: Floats) -> None:
         onto[part[0] : part[1]] += much
 
     for count in (0, 1, 2, 100):

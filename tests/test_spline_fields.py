@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 
+from lfpiv_cli.arrays import Floats, Integers
 from lfpiv_cli.fields import stencils
 from lfpiv_cli.fields.evidence import first_expectation, most_probable
 from lfpiv_cli.fields.fit import FEW_SAMPLES, Field, fit_field
@@ -20,17 +20,17 @@ MANY = FEW_SAMPLES + 20
 LOW, HIGH = np.array([-2.0, -2.0, -2.0]), np.array([2.0, 2.0, 2.0])
 
 
-def drawn(rng: np.random.Generator, count: int, lattice: Lattice = LATTICE) -> NDArray[np.float64]:
+def drawn(rng: np.random.Generator, count: int, lattice: Lattice = LATTICE) -> Floats:
     return rng.uniform(lattice.low_mm, lattice.high_mm, (count, 3))
 
 
-def covariances(rng: np.random.Generator, count: int, sigma: float = 1.0) -> NDArray[np.float64]:
+def covariances(rng: np.random.Generator, count: int, sigma: float = 1.0) -> Floats:
     """Return covariances (n, 3, 3) of different shapes."""
     root = np.eye(3) + 0.3 * rng.normal(size=(count, 3, 3))
     return sigma**2 * root @ root.swapaxes(1, 2)
 
 
-def rows(lattice: Lattice, points: NDArray[np.float64], along: int | None = None) -> NDArray[np.float64]:
+def rows(lattice: Lattice, points: Floats, along: int | None = None) -> Floats:
     """Return the splines of one component (n, k) at points."""
     columns, values = stencils.rows_of(lattice, points, along)
     found = np.zeros((len(points), int(np.prod(lattice.shape))))
@@ -38,7 +38,7 @@ def rows(lattice: Lattice, points: NDArray[np.float64], along: int | None = None
     return found
 
 
-def three_rows(lattice: Lattice, points: NDArray[np.float64]) -> NDArray[np.float64]:
+def three_rows(lattice: Lattice, points: Floats) -> Floats:
     """Return the design (n, 3, unknowns) in the order of the stencils: planes of x, components, y, z."""
     nx, ny, nz = lattice.shape
     one = rows(lattice, points).reshape(len(points), nx, ny * nz)
@@ -155,7 +155,7 @@ def test_a_sample_s_error_without_itself_is_that_of_a_fit_without_it() -> None:
     before = stencils.dense(bound(LATTICE, 0.01))
     weight = np.linalg.inv(covariance)
 
-    def fit(kept: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def fit(kept: Integers) -> tuple[Floats, Floats]:
         inverse = np.linalg.inv(np.einsum("nia,nij,njb->ab", design[kept], weight[kept], design[kept]) + before)
         return inverse @ np.einsum("nia,nij,nj->a", design[kept], weight[kept], values[kept]), inverse
 
@@ -184,20 +184,20 @@ def test_a_far_sample_does_not_belong_and_errors_of_places_turn_into_those_of_va
 # Fields
 
 
-def shear(points: NDArray[np.float64]) -> NDArray[np.float64]:
+def shear(points: Floats) -> Floats:
     """Return a linear solenoidal field."""
     x, y, z = points.T
     return 0.05 * np.stack([0.3 * x + z, -0.1 * y + x, -0.2 * z + 0.5 * y + 1.0], axis=1)
 
 
-def vortices(points: NDArray[np.float64]) -> NDArray[np.float64]:
+def vortices(points: Floats) -> Floats:
     """Return a smooth solenoidal field with waves of 6 mm."""
     x, y, z = (2.0 * np.pi / 6.0 * points).T
     u, v, w = np.cos(x) * np.sin(y) * np.sin(z), np.sin(x) * np.cos(y) * np.sin(z), np.sin(x) * np.sin(y) * np.cos(z)
     return 0.2 * np.stack([u, v, -2.0 * w], axis=1)
 
 
-def swelling(points: NDArray[np.float64]) -> NDArray[np.float64]:
+def swelling(points: Floats) -> Floats:
     """Return a field of sources around the middle."""
     return np.asarray(0.1 * points * np.exp(-np.sum(points**2, axis=1, keepdims=True) / 4.0))
 
@@ -217,7 +217,7 @@ def tracks(flow, count: int, seed: int, wrong: int = 0) -> Samples:  # type: ign
     return Samples(points, values, covariance, np.ones(count), place_share=0.0)
 
 
-def inner(count: int, seed: int) -> NDArray[np.float64]:
+def inner(count: int, seed: int) -> Floats:
     return np.random.default_rng(seed).uniform(0.9 * LOW, 0.9 * HIGH, (count, 3))
 
 
@@ -227,12 +227,12 @@ def fitted(samples: Samples, divergence: str = "penalised") -> SplineField:
     return field
 
 
-def solenoidal_share(field: Field, points: NDArray[np.float64]) -> float:
+def solenoidal_share(field: Field, points: Floats) -> float:
     gradient = field.gradient_at(points)
     return float(np.sqrt(np.mean(np.einsum("nii->n", gradient) ** 2) / np.mean(gradient**2)))
 
 
-def off(field: Field, flow, points: NDArray[np.float64], axis: int | None = 0):  # type: ignore[no-untyped-def]
+def off(field: Field, flow, points: Floats, axis: int | None = 0):  # type: ignore[no-untyped-def]
     """Return the rms error at points, by component or (axis None) of all."""
     return np.sqrt(np.mean((field.value_at(points) - flow(points)) ** 2, axis=axis))
 
@@ -260,7 +260,7 @@ def test_depth_gains_by_what_a_liquid_cannot_do_and_stated_errors_cover_the_trut
     assert np.all(np.sqrt(np.median(variance, axis=0)) < [3e-3, 3e-3, 8e-3])
 
 
-def beltrami(points: NDArray[np.float64]) -> NDArray[np.float64]:
+def beltrami(points: Floats) -> Floats:
     """Return a smooth solenoidal field whose depth component does not change with depth."""
     x, y, z = (2.0 * np.pi / 6.0 * points).T
     return 0.2 * np.stack([np.sin(z) + np.cos(y), np.sin(x) + np.cos(z), np.sin(y) + np.cos(x)], axis=1)
@@ -328,7 +328,7 @@ def test_few_samples_are_kriged_without_divergence(seed: int) -> None:
 
 @pytest.mark.thorough
 def test_walls_hold_the_field_still() -> None:
-    def between_walls(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    def between_walls(points: Floats) -> Floats:
         return np.stack([0.3 * (1.0 - (points[:, 2] / 2.0) ** 2), 0.0 * points[:, 0], 0.0 * points[:, 0]], axis=1)
 
     x, y = np.meshgrid(np.linspace(-2, 2, 9), np.linspace(-2, 2, 9))

@@ -10,9 +10,9 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 import lfpiv_cli as lf
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.errors import InputError, OutputExistsError, UsageError
 from lfpiv_cli.files.config import load_rig
 from lfpiv_cli.files.particle_file import TRACKS_FORMAT, Points, symmetric, write_points
@@ -33,7 +33,7 @@ STRESSES = np.array([[1.0, 0.5, -0.2], [0.5, 2.0, 0.3], [-0.2, 0.3, 0.7]])
 AS_SIX = STRESSES[[0, 1, 2, 0, 1, 0], [0, 1, 2, 1, 2, 2]]
 
 
-def ensemble(values: NDArray[np.float64], noise: NDArray[np.float64] | None = None) -> Ensemble:
+def ensemble(values: Floats, noise: Floats | None = None) -> Ensemble:
     """Return values (frames, places, 3) and the variances of their errors as what was measured at nodes."""
     frames, places, _ = values.shape
     frame, place = (each.ravel() for each in np.indices((frames, places)))
@@ -43,7 +43,7 @@ def ensemble(values: NDArray[np.float64], noise: NDArray[np.float64] | None = No
     return Ensemble(places, frames, place, frame, values.reshape(-1, 3), six, np.zeros((len(place), 0)))
 
 
-def gaussian(rng: np.random.Generator, frames: int, places: int, memory: float = 0.0) -> NDArray[np.float64]:
+def gaussian(rng: np.random.Generator, frames: int, places: int, memory: float = 0.0) -> Floats:
     """Return Gaussian fluctuations (frames, places, 3) with those stresses, AR(1) in time."""
     drawn = rng.standard_normal((frames, places, 3))
     for number in range(1, frames):
@@ -182,9 +182,7 @@ def test_memory_is_found_among_gaps(rng: np.random.Generator) -> None:
     assert decorrelation(np.zeros((2, 2, 3)), 1).tolist() == [1.0, 1.0, 1.0]
 
 
-def tracks_of(
-    places: NDArray[np.float64], velocity: NDArray[np.float64], sigma_mm: NDArray[np.float64], config: Path = CONFIG
-) -> Points:
+def tracks_of(places: Floats, velocity: Floats, sigma_mm: Floats, config: Path = CONFIG) -> Points:
     """Return tracks of a pair at places, with errors of stated size."""
     rig = load_rig(config)
     dt_s = float(rig.correlation.dt_s or DT_S)
@@ -207,7 +205,7 @@ SIGMA_MM = np.array([0.005, 0.005, 0.03])
 
 
 def measured(
-    rng: np.random.Generator, flow: Any, pairs: int, count: int, half_mm: NDArray[np.float64], config: Path = CONFIG
+    rng: np.random.Generator, flow: Any, pairs: int, count: int, half_mm: Floats, config: Path = CONFIG
 ) -> list[Points]:
     """Return tracks of pairs in a flow (of points and the pair's number), with errors of `SIGMA_MM`."""
     dt_s = float(load_rig(config).correlation.dt_s or DT_S)
@@ -223,7 +221,7 @@ HALF_MM = np.array([1.5, 1.1, 2.0])
 
 
 def test_shear_within_a_bin_is_no_fluctuation(rng: np.random.Generator) -> None:
-    def shear(places: NDArray[np.float64], _number: int) -> NDArray[np.float64]:
+    def shear(places: Floats, _number: int) -> Floats:
         return np.stack([0.1 + 0.08 * places[:, 2], 0.05 * places[:, 0], 0.0 * places[:, 1]], axis=1)
 
     tracks = measured(rng, shear, 30, 300, HALF_MM)
@@ -252,7 +250,7 @@ def test_without_any_tracks_no_place_has_statistics() -> None:
 
 
 def test_curved_means_in_bins_are_told(rng: np.random.Generator) -> None:
-    def curved(places: NDArray[np.float64], _number: int) -> NDArray[np.float64]:
+    def curved(places: Floats, _number: int) -> Floats:
         return np.stack([0.3 - 0.06 * places[:, 2] ** 2, *np.zeros((2, len(places)))], axis=1)
 
     tracks = measured(rng, curved, 30, 300, HALF_MM)
@@ -320,7 +318,7 @@ def test_the_channel_of_the_experiment_has_its_mean_and_no_stress(
 def test_profiles_around_an_axis_turn_what_they_average(rng: np.random.Generator) -> None:
     flow, angular = pipe(2.0, 0.1), 0.02
 
-    def swirl(places: NDArray[np.float64], number: int) -> NDArray[np.float64]:
+    def swirl(places: Floats, number: int) -> Floats:
         radial = np.linalg.norm(places[:, 1:], axis=1, keepdims=True)
         around = np.cross([1.0, 0.0, 0.0], places)
         outward = np.concatenate([np.zeros((len(places), 1)), places[:, 1:]], axis=1) / radial
@@ -365,7 +363,7 @@ def told_of(found: FlowStatistics) -> list[str]:
 
 
 def test_what_speaks_against_statistics_is_told_and_ordinary_ones_are_quiet(rng: np.random.Generator) -> None:
-    def batch(values: NDArray[np.float64], sigma: float) -> FlowStatistics:
+    def batch(values: Floats, sigma: float) -> FlowStatistics:
         first = fields(rng, 1)[0]
         stated = np.full((*SHAPE, 3), sigma)
         return of_fields(

@@ -5,8 +5,8 @@ from typing import get_args
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.names import Facing, SurfaceKind
 from lfpiv_cli.optics import surfaces
@@ -168,7 +168,7 @@ MENISCUS = CurvedSpace(
 # Other programs find a crossing to 1e-10 mm or so, and 200 mm have 3e-14.
 AGREEMENT_MM = 1e-9
 
-Rays = NDArray[np.float64]
+Rays = Floats
 # From places (n, 3) and directions (n, 3) at the lens, and depths in the fluid, to places there.
 Tracer = Callable[[CurvedSpace, Rays, Rays, Rays], Rays]
 

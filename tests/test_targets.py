@@ -5,8 +5,8 @@ from functools import cache
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Singles
 from lfpiv_cli.calibration.board import another_kind, dot_signal, locate_board, sentence
 from lfpiv_cli.calibration.board_pose import BoardGeometry, BoardPose, off_focus_mm, pose_of_dots, upright_numbers
 from lfpiv_cli.calibration.corners import quadrant_shares
@@ -38,12 +38,12 @@ def large(camera: Camera) -> Camera:
     return small(camera, 680, 560)
 
 
-def picture(camera: Camera, board: BoardGeometry, placement: BoardPlacement) -> NDArray[np.float32]:
+def picture(camera: Camera, board: BoardGeometry, placement: BoardPlacement) -> Singles:
     return render_board(camera, AIR, board, placement, LEVEL, np.random.default_rng(5)).astype(np.float32)
 
 
 @cache
-def at_one_mm(board: BoardGeometry) -> NDArray[np.float32]:
+def at_one_mm(board: BoardGeometry) -> Singles:
     return picture(large(PAPERS) if board.pattern == "charuco" else small(PAPERS), board, BoardPlacement(1.0))
 
 
@@ -186,7 +186,7 @@ ASKEW = BoardPlacement(2.0, (0.07, -0.04), (1.0, -0.5), 1.5)
 
 
 @cache
-def dots_askew(diameter_mm: float, *, is_origin: bool) -> NDArray[np.float32]:
+def dots_askew(diameter_mm: float, *, is_origin: bool) -> Singles:
     """The origin, or the other dots of the board, of a diameter."""
     board, shown = replace(DOTS, dot_diameter_mm=diameter_mm), (np.arange(20) == 7) == is_origin
     return render_board(small(PAPERS), AIR, board, ASKEW, LEVEL, np.random.default_rng(5), shown)

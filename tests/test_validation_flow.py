@@ -5,8 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Flags, Floats
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.flow.field import REJECTED, VALID, VectorField
 from lfpiv_cli.flow.windows import RoundWall
@@ -21,7 +21,7 @@ VOXEL_MM = (0.1, 0.1, 0.2)
 DT_S = 0.001
 
 
-def field_of(velocity: NDArray[np.float64]) -> VectorField:
+def field_of(velocity: Floats) -> VectorField:
     """A field with given velocities in m/s, in which every vector is valid."""
     nz, ny, nx = velocity.shape[:3]
     displacement = velocity * DT_S / (np.array(VOXEL_MM) * 1e-3)
@@ -32,7 +32,7 @@ def field_of(velocity: NDArray[np.float64]) -> VectorField:
 
 
 @pytest.fixture
-def truth() -> NDArray[np.float64]:
+def truth() -> Floats:
     """A flow along y that grows with x."""
     velocity = np.zeros((*SHAPE, 3))
     velocity[..., 1] = 0.1 * (1.0 + np.arange(5))
@@ -40,13 +40,11 @@ def truth() -> NDArray[np.float64]:
 
 
 @pytest.fixture
-def inside() -> NDArray[np.bool_]:
+def inside() -> Flags:
     return np.ones(SHAPE, dtype=np.bool_)
 
 
-def test_the_truth_itself_has_no_error_and_a_vortex_no_streamwise_figures(
-    truth: NDArray[np.float64], inside: NDArray[np.bool_]
-) -> None:
+def test_the_truth_itself_has_no_error_and_a_vortex_no_streamwise_figures(truth: Floats, inside: Flags) -> None:
     figures = flow_figures(Measured(field_of(truth), truth, inside))
     assert figures["streamwise_mean_error"] == pytest.approx(0.0, abs=1e-12)
     assert figures["within_25_percent_streamwise"] == figures["within_25_percent_vector"] == 1.0
@@ -59,9 +57,7 @@ def test_the_truth_itself_has_no_error_and_a_vortex_no_streamwise_figures(
     assert figures["within_25_percent_vector"] == 1.0
 
 
-def test_components_are_in_their_own_voxels_and_slices_between_planes(
-    truth: NDArray[np.float64], inside: NDArray[np.bool_]
-) -> None:
+def test_components_are_in_their_own_voxels_and_slices_between_planes(truth: Floats, inside: Flags) -> None:
     measured = truth + (0.01, -0.02, 0.04)
     measured[::2] += (0.02, 0.0, 0.0)
     figures = flow_figures(Measured(field_of(measured), truth, inside))
@@ -84,7 +80,7 @@ def test_components_are_in_their_own_voxels_and_slices_between_planes(
 
 
 def test_shares_of_streamwise_and_full_vectors_differ_and_meet_the_cumulative_distribution(
-    truth: NDArray[np.float64], inside: NDArray[np.bool_], rng: np.random.Generator
+    truth: Floats, inside: Flags, rng: np.random.Generator
 ) -> None:
     measured = truth.copy()
     measured[0, ..., 1] *= 1.3
@@ -100,7 +96,7 @@ def test_shares_of_streamwise_and_full_vectors_differ_and_meet_the_cumulative_di
     assert shares[25] == pytest.approx(figures["within_25_percent_streamwise"])
 
 
-def test_misses_lower_the_shares(truth: NDArray[np.float64], inside: NDArray[np.bool_]) -> None:
+def test_misses_lower_the_shares(truth: Floats, inside: Flags) -> None:
     field = field_of(truth)
     flag = field.flag.copy()
     flag[0] = REJECTED
@@ -133,9 +129,7 @@ def test_misses_lower_the_shares(truth: NDArray[np.float64], inside: NDArray[np.
 
 
 @pytest.mark.parametrize("dt_s", [None, DT_S])
-def test_figures_are_valid_json_without_nan(
-    dt_s: float | None, truth: NDArray[np.float64], inside: NDArray[np.bool_]
-) -> None:
+def test_figures_are_valid_json_without_nan(dt_s: float | None, truth: Floats, inside: Flags) -> None:
     field = field_of(truth)
     rejected = np.full(SHAPE, REJECTED, dtype=np.uint8)
     figures = flow_figures(Measured(replace(field, flag=rejected, dt_s=dt_s), truth, inside))
@@ -215,7 +209,7 @@ def test_a_pipes_figures_go_by_the_distance_from_its_axis() -> None:
 
 
 @pytest.mark.parametrize("what", ["shape", "nothing inside", "truth"])
-def test_what_cannot_be_compared_is_refused(what: str, truth: NDArray[np.float64], inside: NDArray[np.bool_]) -> None:
+def test_what_cannot_be_compared_is_refused(what: str, truth: Floats, inside: Flags) -> None:
     field = field_of(truth)
     if what == "shape":
         truth = truth[1:]
@@ -249,7 +243,7 @@ def test_truth_from_few_or_level_particles_stays_finite(count: int, rng: np.rand
 
 
 @pytest.fixture
-def methods(truth: NDArray[np.float64], inside: NDArray[np.bool_]) -> dict[str, Measured]:
+def methods(truth: Floats, inside: Flags) -> dict[str, Measured]:
     """One method that errs by a tenth and has missed a column of windows, and a perfect one."""
     field = field_of(truth * 1.1)
     flag = field.flag.copy()
@@ -259,7 +253,7 @@ def methods(truth: NDArray[np.float64], inside: NDArray[np.bool_]) -> dict[str, 
 
 
 def test_pictures_show_truth_and_methods_on_one_scale(
-    methods: dict[str, Measured], truth: NDArray[np.float64], inside: NDArray[np.bool_]
+    methods: dict[str, Measured], truth: Floats, inside: Flags
 ) -> None:
     pytest.importorskip("matplotlib")
     from lfpiv_cli.validation.methods import flow_figure
@@ -294,7 +288,7 @@ def test_pictures_show_truth_and_methods_on_one_scale(
     assert "true, analytic" not in told
 
 
-def test_an_analytic_flow_is_a_line_beyond_the_outer_windows(inside: NDArray[np.bool_]) -> None:
+def test_an_analytic_flow_is_a_line_beyond_the_outer_windows(inside: Flags) -> None:
     pytest.importorskip("matplotlib")
     from lfpiv_cli.validation.methods import profiles_figure
 
@@ -312,7 +306,7 @@ def test_an_analytic_flow_is_a_line_beyond_the_outer_windows(inside: NDArray[np.
     assert along_v.get_ylim()[1] >= 0.02 * np.abs(truth).max()
 
 
-def test_the_method_with_the_lower_error_is_named(truth: NDArray[np.float64], inside: NDArray[np.bool_]) -> None:
+def test_the_method_with_the_lower_error_is_named(truth: Floats, inside: Flags) -> None:
     noisy, biased = truth.copy(), truth + (0.0, 0.001, 0.0)
     noisy[..., 1] += 0.02 * (-1.0) ** np.arange(60).reshape(SHAPE)
     # An outlier where the other method has found nothing does not count between them.

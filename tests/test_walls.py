@@ -5,8 +5,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.errors import ConfigError, InputError
 from lfpiv_cli.files.config import Config, load_rig
 from lfpiv_cli.optics.camera import Camera, Lattice
@@ -121,7 +121,7 @@ def scene(config: Config) -> MovableScene:
     return MovableScene.of(space, config.camera_model())
 
 
-def seeded(count: int, rng: np.random.Generator, share: float = 0.3) -> NDArray[np.float64]:
+def seeded(count: int, rng: np.random.Generator, share: float = 0.3) -> Floats:
     """Places (n, 3) in a pipe's own frame, denser away from the camera, in directions in which the wall is seen."""
     along, across, away = rng.uniform(-5.0, 5.0, (3, 4 * count))
     inside = np.hypot(across, away) < 5.0
@@ -130,9 +130,7 @@ def seeded(count: int, rng: np.random.Generator, share: float = 0.3) -> NDArray[
     return np.column_stack([along, across, away])[inside][:count]
 
 
-def seen_behind(
-    scene: MovableScene, truth: NDArray[np.float64], own: NDArray[np.float64], rng: np.random.Generator
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def seen_behind(scene: MovableScene, truth: Floats, own: Floats, rng: np.random.Generator) -> tuple[Floats, Floats]:
     """Particles of a pipe that lies at `truth`, found behind the scene as it is told: places and covariances."""
     camera = scene.camera
     true = scene.on_axis(np.zeros(1), truth) + own @ scene.frame(truth) + rng.normal(0.0, SIGMA_MM, own.shape)
@@ -249,7 +247,7 @@ def test_bodies_move_as_one(config: Config, rng: np.random.Generator) -> None:
         heights.moved(motion)
 
 
-def refined(scene: MovableScene, rng: np.random.Generator, images: NDArray[np.float64]) -> SceneRefinement:
+def refined(scene: MovableScene, rng: np.random.Generator, images: Floats) -> SceneRefinement:
     """What particles and images of some standard errors would tell together."""
     placed, covariance = seen_behind(scene, TRUTH, seeded(2500, rng), rng)
     axis, axis_covariance, wall, places = wall_by_places(placed, covariance, scene, np.zeros(4))

@@ -7,6 +7,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.special import j1
 
+from lfpiv_cli.arrays import Floats, Singles
 from lfpiv_cli.calibration.board import DotLook, disc_shape, locate_board
 from lfpiv_cli.calibration.board_pose import BoardGeometry
 from lfpiv_cli.calibration.shape_fit import pixels_near
@@ -51,17 +52,17 @@ def by_rays(camera: Camera, point: tuple[float, float, float], space=AIR, diamet
     return render_points(camera, space, Balls(np.array([point]), 1.0, diameter), np.random.default_rng(0), rays=rays)
 
 
-def apart(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
+def apart(a: Floats, b: Floats) -> float:
     """Return L1, the light of images of light 1 that lies elsewhere, twice."""
     return float(np.abs(a - b).sum())
 
 
-def centre(image: NDArray[np.float64]) -> NDArray[np.float64]:
+def centre(image: Floats) -> Floats:
     row, column = np.indices(image.shape)
     return np.array([(image * column).sum(), (image * row).sum()]) / image.sum()
 
 
-def per_lens(camera: Camera, image: NDArray[np.float64]) -> NDArray[np.float64]:
+def per_lens(camera: Camera, image: Floats) -> Floats:
     """Return the light under each microlens."""
     pixels = np.stack(np.indices(image.shape)[::-1], axis=-1)
     index = camera.micro_image_lattice_px().nearest(pixels).reshape(-1, 2)
@@ -86,7 +87,7 @@ def quadrature(camera: Camera, point: tuple[float, float, float], wavelength: fl
     half = 0.07 * abs(z) + 0.5
     x, y = (np.arange(-half, half, step) - at * s_i / s_o for at in (x0, y0))
 
-    def to_array(place: NDArray[np.float64]) -> NDArray[np.complex128]:
+    def to_array(place: Floats) -> NDArray[np.complex128]:
         return np.exp(-1j * k * np.outer(place, pupil) / s_i) * np.exp(1j * k * place**2 / (2 * s_i))[:, np.newaxis]
 
     places = np.stack(np.meshgrid(x, y), axis=-1)
@@ -98,7 +99,7 @@ def quadrature(camera: Camera, point: tuple[float, float, float], wavelength: fl
     on_sensor = camera.px_to_mm(np.stack([fine, fine], axis=-1))
     reach = wavelength * s_mu / step
 
-    def to_sensor(there: NDArray[np.float64], here: NDArray[np.float64]) -> NDArray[np.complex128]:
+    def to_sensor(there: Floats, here: Floats) -> NDArray[np.complex128]:
         beside = there[:, np.newaxis] - here
         soft = np.cos(0.5 * np.pi * np.clip((np.abs(beside) / reach - 0.35) / 0.1, 0.0, 1.0)) ** 2
         return soft * np.exp(1j * k * beside**2 / (2 * s_mu))
@@ -358,7 +359,7 @@ def shapes(near_camera: Camera) -> WaveShapes:
 
 
 @pytest.fixture(scope="module")
-def picture(near_camera: Camera) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
+def picture(near_camera: Camera) -> tuple[Floats, Singles]:
     """A dot's light and that of a white image."""
     light = Waves(LIGHT.wavelength_mm)
     place = BoardPlacement(0.3, (0.13, 0.07))
@@ -367,7 +368,7 @@ def picture(near_camera: Camera) -> tuple[NDArray[np.float64], NDArray[np.float3
 
 
 def test_a_dot_by_waves_lies_where_it_is(
-    near_camera: Camera, shapes: WaveShapes, picture: tuple[NDArray[np.float64], NDArray[np.float32]]
+    near_camera: Camera, shapes: WaveShapes, picture: tuple[Floats, Singles]
 ) -> None:
     """By rays it does not: near focus its light comes through few lenses, of which some are lit in part."""
     look, start = DotLook(*picture, Media(), RADIUS, PLACE[np.newaxis, :2], PLACE[2]), PLACE + (0.004, -0.004, 0.02)

@@ -8,6 +8,7 @@ import pytest
 from numpy.typing import NDArray
 
 from benchmarks.volumes import Seeding, volume_pair
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.files.config import load_rig
 from lfpiv_cli.flow.correlation import Coarse, correlate, plan
@@ -99,7 +100,7 @@ def layout_of(size: tuple[int, int, int], overlap: tuple[float, float, float]) -
     return replace(layout_windows((22, 20, 18), size, overlap), weighting="gaussian")
 
 
-def weights_in(layout: WindowLayout) -> NDArray[np.float64]:
+def weights_in(layout: WindowLayout) -> Floats:
     """The weights [z, y, x] of a window's voxels, by the definition: a Gaussian of a quarter of the size."""
     axes = [(np.arange(n) - 0.5 * (n - 1)) / n for n in layout.size[::-1]]
     z, y, x = np.meshgrid(*axes, indexing="ij")
@@ -205,7 +206,7 @@ def test_one_displacement_is_found_without_bias_and_its_errors_are_stated(rng: n
 
 @pytest.mark.thorough
 def test_a_curved_shear_loses_less_than_in_uniform_windows(rng: np.random.Generator) -> None:
-    def wave(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    def wave(points: Floats) -> Floats:
         moved = np.zeros(points.shape)
         moved[:, 0] = 0.8 * np.sin(2.0 * np.pi * points[:, 1] / 32.0)
         return moved
@@ -226,26 +227,24 @@ FIELD_SHAPE = (12, 16, 12)
 NOISE = np.full(3, EXPECTED_NOISE_VOXEL)
 
 
-def indices() -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+def indices() -> tuple[Floats, Floats, Floats]:
     z, y, x = np.meshgrid(*(np.arange(n, dtype=np.float64) for n in FIELD_SHAPE), indexing="ij")
     return x, y, z
 
 
-def linear_field() -> NDArray[np.float64]:
+def linear_field() -> Floats:
     x, y, z = indices()
     return np.stack([0.7 * y - 0.3 * z, 0.5 * x, 0.2 * x - 0.4 * y + 0.1 * z], axis=-1)
 
 
-def channel_field() -> NDArray[np.float64]:
+def channel_field() -> Floats:
     """The parabola of the paper's channel: 4 voxels at its middle, nothing at the walls; flow along y."""
     x, _, z = indices()
     profile = 4.0 * (1.0 - ((x - 5.5) / 6.0) ** 2) * (1.0 - ((z - 5.5) / 6.0) ** 2)
     return np.stack([np.zeros(FIELD_SHAPE), profile, np.zeros(FIELD_SHAPE)], axis=-1)
 
 
-def validated(
-    raw: NDArray[np.float64], second: NDArray[np.float64] | None = None
-) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
+def validated(raw: Floats, second: Floats | None = None) -> tuple[Floats, NDArray[np.uint8]]:
     """Validate a field whose NaN are windows without a peak."""
     measured = np.isfinite(raw).all(axis=-1)
     nowhere = np.zeros(raw.shape[:3], dtype=np.bool_)
@@ -253,7 +252,7 @@ def validated(
 
 
 @pytest.mark.parametrize("field", [linear_field(), channel_field()], ids=["linear", "channel"])
-def test_clean_shear_raises_no_false_alarm(field: NDArray[np.float64], rng: np.random.Generator) -> None:
+def test_clean_shear_raises_no_false_alarm(field: Floats, rng: np.random.Generator) -> None:
     noisy = field + rng.normal(0.0, 0.06, field.shape)
     displacement, flag = validated(noisy)
     assert np.all(flag == VALID)
