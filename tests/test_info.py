@@ -13,9 +13,10 @@ from lfpiv_cli.errors import UsageError
 from lfpiv_cli.files.hdf5 import write_tree
 from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, TRACKS_FORMAT, TRAJECTORIES_FORMAT, Points, write_points
 from lfpiv_cli.files.vtkhdf import write_vectors, write_volume
-from lfpiv_cli.flow.field import REJECTED, REPLACED, VALID, VectorField
+from lfpiv_cli.flow.field import REJECTED, REPLACED, VALID
 from lfpiv_cli.grid import Grid, Reference
 from tests.commands import table2_rig
+from tests.vector_fields import field_on
 
 AT_FOCUS = Reference("focal_point", 0.0)
 VOXELS = Grid.centred((1, 2, 3), (0.1, 0.1, 0.2), (0.0, 0.0, 0.0))
@@ -65,9 +66,9 @@ def test_info_counts_vectors_by_flag_and_gives_medians(tmp_path):
     path = tmp_path / "vectors.vtkhdf"
     displacement = np.array([[1.0, 0.0, 5.0], [3.0, 0.0, 6.0], [99.0, 0.0, 99.0]]).reshape(3, 1, 1, 3)
     sigma = np.array([[0.1, np.nan, 1.0], [0.3, np.nan, 2.0], [9.0, 9.0, 9.0]]).reshape(3, 1, 1, 3)
-    ones, flag = np.ones((3, 1, 1)), np.array([VALID, REPLACED, REJECTED], np.uint8).reshape(3, 1, 1)
+    flag = np.array([VALID, REPLACED, REJECTED], np.uint8).reshape(3, 1, 1)
     grid = Grid.centred((1, 1, 3), (0.1, 0.1, 0.1), (0.0, 0.0, 0.0))
-    field = VectorField(grid, displacement, displacement, ones, ones, ones, flag, sigma, (0.1,) * 3, 1e-3, (8,) * 3)
+    field = field_on(grid, displacement, flag, sigma)
     made = {
         "command": "correlate",
         "warnings": [dict.fromkeys(("about", "text", "remedy"), "a") | {"code": "few-tracers"}],

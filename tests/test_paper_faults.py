@@ -14,7 +14,6 @@ from lfpiv_cli.arrays import Floats
 from lfpiv_cli.cli.main import cli
 from lfpiv_cli.errors import LimitMissedError
 from lfpiv_cli.files.vtkhdf import write_vectors
-from lfpiv_cli.flow.field import VALID, VectorField
 from lfpiv_cli.grid import FOCAL_POINT, Grid
 from lfpiv_cli.optics.media import equivalent_object_distance
 from lfpiv_cli.paper import faults, influences, small_rig
@@ -24,6 +23,7 @@ from lfpiv_cli.paper.parts import sections
 from lfpiv_cli.paper.sensitivities import INFLUENCES, Measured, care, crowding, drawing_of, rows_of, table_of
 from lfpiv_cli.paper.small_rig import CHANNEL, WATER, Case, Rig, displacement
 from lfpiv_cli.validation.volume import TERMS, fit_errors, pairs_of
+from tests.vector_fields import field_on
 
 # Of places and displacements, x, y and z, mm.
 SIGMA_MM = np.array([1e-4, 1e-4, 3e-3])
@@ -134,9 +134,7 @@ def test_validate_flow_fails_on_velocities_of_the_wrong_sign(
     z = grid.centres_mm()[..., 2]
     # u = 0.1 m/s + z 20/s, w = 0.05 m/s, with signs; of voxels of 0.1 mm in 1 ms.
     moved = np.stack([0.1 + 0.02 * z, 0.0 * z, 0.0 * z + 0.05], axis=-1) * signs * 1000.0 * 0.001 / 0.1
-    ones, flag = np.ones(z.shape), np.full(z.shape, VALID, np.uint8)
-    field = VectorField(grid, moved, moved, ones, ones, ones, flag, None, (0.1, 0.1, 0.1), 0.001, (16, 16, 16))
-    write_vectors(vectors, field, FOCAL_POINT, provenance={}, overwrite=False)
+    write_vectors(vectors, field_on(grid, moved), FOCAL_POINT, provenance={}, overwrite=False)
     ended = CliRunner().invoke(cli, ["validate", "flow", str(config), "--vectors", str(vectors), "-o", str(tmp_path)])
     told = ended.exception.exit_code if isinstance(ended.exception, LimitMissedError) else ended.exit_code
     assert told == exit_code, ended.output

@@ -18,7 +18,7 @@ from lfpiv_cli.console import Console
 from lfpiv_cli.errors import InputError, LimitMissedError, OutputExistsError, UsageError
 from lfpiv_cli.files.config import load_rig
 from lfpiv_cli.files.pages import Table, ensure_pages
-from lfpiv_cli.flow.field import REJECTED, VALID, VectorField
+from lfpiv_cli.flow.field import REJECTED, VALID
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.names import PaperPart, names_in
 from lfpiv_cli.paper import run, table3, table4
@@ -31,6 +31,7 @@ from lfpiv_cli.validation.board import MEASURES
 from lfpiv_cli.validation.flow import PAPER_OVERALL, PAPER_SLICES, Duct, Measured
 from lfpiv_cli.validation.methods import profile_at, slice_at
 from lfpiv_cli.verbs.simulate import board_depths
+from tests.vector_fields import field_on
 
 ROOT = Path(__file__).parents[1]
 TINY = PaperOptions(size="tiny")
@@ -339,11 +340,9 @@ def measured(velocity: np.ndarray) -> Measured:
     """Return a measured flow along x beside a true one of 1 m/s."""
     truth = np.zeros((*GRID.shape_zyx, 3))
     truth[..., 0] = 1.0
-    whole, ones = velocity * 10.0, np.ones(GRID.shape_zyx)
     flag = np.where(np.isfinite(velocity).all(axis=-1), VALID, REJECTED).astype(np.uint8)
     # a tenth of a millimetre in a millisecond for 0.1 m/s
-    field = VectorField(GRID, whole, whole, ones, ones, ones, flag, None, (0.1, 0.1, 0.1), 1e-3, (8, 8, 8))
-    return Measured(field, truth, np.ones(GRID.shape_zyx, bool))
+    return Measured(field_on(GRID, velocity * 10.0, flag), truth, np.ones(GRID.shape_zyx, bool))
 
 
 @pytest.mark.thorough

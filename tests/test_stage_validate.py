@@ -14,12 +14,12 @@ from lfpiv_cli.errors import ConfigError, LimitMissedError, OutputExistsError, U
 from lfpiv_cli.files.config import load_rig
 from lfpiv_cli.files.particles import Particles, write_particles
 from lfpiv_cli.files.vtkhdf import write_vectors
-from lfpiv_cli.flow.field import VectorField
 from lfpiv_cli.grid import Grid, Reference
 from lfpiv_cli.synthetic.flows import shear
 from lfpiv_cli.verbs import validate
 from lfpiv_cli.verbs.validate import _truth_of_particles, light_notices, validate_flow
 from tests.commands import CONFIG, run, sample_rig, told
+from tests.vector_fields import field_on
 
 
 def test_a_missed_limit_keeps_no_other_report_from_being_made(monkeypatch, tmp_path):
@@ -96,9 +96,7 @@ def vectors(tmp_path: Path) -> Path:
     """The sample's flow, measured without an error."""
     grid = Grid.centred((3, 4, 5), (0.5, 0.5, 0.5), (0.0, 0.0, 0.0))
     velocity = shear(30.0, velocity_m_s=(0.12, 0.0, 0.0))(grid.centres_mm().reshape(-1, 3)).reshape(5, 4, 3, 3)
-    displacement, one = velocity * 1e-3 / 1e-4, np.ones((5, 4, 3))
-    flag = np.zeros((5, 4, 3), np.uint8)
-    field = VectorField(grid, displacement, displacement, one, one, one, flag, None, (0.1,) * 3, 1e-3, (8,) * 3)
+    field = field_on(grid, velocity * 1e-3 / 1e-4)
     write_vectors(tmp_path / "vectors.vtkhdf", field, Reference("focal_point", 0.0), provenance={}, overwrite=True)
     return tmp_path / "vectors.vtkhdf"
 

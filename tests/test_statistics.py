@@ -25,6 +25,7 @@ from lfpiv_cli.synthetic.flows import pipe, random_modes, square_duct
 from lfpiv_cli.verbs.moments import FlowStatistics, notices_of, of_fields, of_tracks, parse_profile, profile_on
 from lfpiv_cli.verbs.plot import figures_of
 from tests.commands import CONFIG, run, told
+from tests.vector_fields import field_on
 
 SHAPE, DT_S, VOXEL_MM = (2, 3, 4), 1e-3, (0.1, 0.1, 0.1)
 TO_M_S = 1e-3 / DT_S
@@ -52,13 +53,9 @@ def gaussian(rng: np.random.Generator, frames: int, places: int, memory: float =
 
 
 def fields(rng: np.random.Generator, count: int) -> list[VectorField]:
-    ones, flag = np.ones(SHAPE), np.zeros(SHAPE, dtype=np.uint8)
     grid = Grid(SHAPE[::-1], (0.8,) * 3, (0.0,) * 3)
     # A large mean, in which sums of squares would lose the fluctuations.
-    return [
-        VectorField(grid, moved, moved, ones, ones, ones, flag, None, VOXEL_MM, DT_S, (8, 8, 8))
-        for moved in 1e6 + rng.standard_normal((count, *SHAPE, 3))
-    ]
+    return [field_on(grid, moved, dt_s=DT_S) for moved in 1e6 + rng.standard_normal((count, *SHAPE, 3))]
 
 
 def test_moments_are_those_of_the_stack_without_what_was_not_measured(rng: np.random.Generator) -> None:

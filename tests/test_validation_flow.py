@@ -8,13 +8,14 @@ import pytest
 
 from lfpiv_cli.arrays import Flags, Floats
 from lfpiv_cli.errors import InputError
-from lfpiv_cli.flow.field import REJECTED, VALID, VectorField
+from lfpiv_cli.flow.field import REJECTED, VectorField
 from lfpiv_cli.flow.windows import RoundWall
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.synthetic.flows import pipe, shear, square_duct
 from lfpiv_cli.validation import flow as of_flow
 from lfpiv_cli.validation.flow import Duct, Measured, cumulative_distribution, flow_figures, truth_at_points
 from lfpiv_cli.validation.methods import lower_error
+from tests.vector_fields import field_on
 
 SHAPE = (4, 3, 5)
 VOXEL_MM = (0.1, 0.1, 0.2)
@@ -24,11 +25,8 @@ DT_S = 0.001
 def field_of(velocity: Floats) -> VectorField:
     """A field with given velocities in m/s, in which every vector is valid."""
     nz, ny, nx = velocity.shape[:3]
-    displacement = velocity * DT_S / (np.array(VOXEL_MM) * 1e-3)
-    ones = np.ones((nz, ny, nx))
-    flag = np.full((nz, ny, nx), VALID, dtype=np.uint8)
     grid = Grid((nx, ny, nz), (0.8, 0.8, 1.6), (0.0, 0.0, 0.0))
-    return VectorField(grid, displacement, displacement, ones, ones, ones, flag, None, VOXEL_MM, DT_S, (16, 16, 16))
+    return field_on(grid, velocity * DT_S / (np.array(VOXEL_MM) * 1e-3), voxel_mm=VOXEL_MM, dt_s=DT_S)
 
 
 @pytest.fixture

@@ -16,7 +16,17 @@ from lfpiv_cli.flow.outliers import INTERPOLATION_VOXEL, mixing, smooth_field, u
 from lfpiv_cli.flow.peaks import LOCKING_LENSES, with_locking
 from lfpiv_cli.flow.windows import CorrelationSettings, ParallelWalls, RoundWall, inside
 from lfpiv_cli.grid import Grid, Reference, Scale
-from tests.vector_fields import SHAPE, SIGMA_VOXEL, SPACING_MM, VOXEL_MM, field_of, noise_mm, places_mm, rotation_mm
+from tests.vector_fields import (
+    SHAPE,
+    SIGMA_VOXEL,
+    SPACING_MM,
+    VOXEL_MM,
+    field_of,
+    field_on,
+    noise_mm,
+    places_mm,
+    rotation_mm,
+)
 
 
 @pytest.mark.parametrize("understated", [1.0, 5.0])
@@ -64,8 +74,7 @@ def linear_field(gradient: np.ndarray, shape: tuple[int, int, int] = (4, 5, 6)) 
     """A linear flow of a given gradient (1/s), in voxels of 0.1 x 0.1 x 0.2 mm and 1 ms."""
     grid = Grid(shape[::-1], (0.8, 0.4, 1.6), (-1.0, 2.0, 0.5))
     moved = grid.centres_mm() * 1e-3 @ gradient.T * 1e-3 / (np.array([0.1, 0.1, 0.2]) * 1e-3)
-    ones, flag = np.ones(shape), np.zeros(shape, dtype=np.uint8)
-    return of_field.VectorField(grid, moved, moved, ones, ones, ones, flag, None, (0.1, 0.1, 0.2), 1e-3, (8, 8, 8))
+    return field_on(grid, moved, voxel_mm=(0.1, 0.1, 0.2))
 
 
 def test_rotation_shear_and_expansion() -> None:
@@ -103,12 +112,9 @@ def test_gradients_are_unknown_where_vectors_are_missing_or_there_is_one_plane()
 
 
 def test_velocity_is_displacement_over_time_in_metres_up_to_the_second_peak() -> None:
-    displacement, ones = np.tile([1.0, -2.0, 0.5], (1, 1, 5, 1)), np.ones((1, 1, 5))
     flag = np.array([VALID, of_field.REPLACED, of_field.SECOND_PEAK, REJECTED, MASKED], dtype=np.uint8).reshape(1, 1, 5)
-    grid, voxel = Grid((5, 1, 1), (0.8, 0.8, 0.8), (0.0, 0.0, 0.0)), (0.1, 0.1, 0.2)
-    field = of_field.VectorField(
-        grid, displacement, displacement, ones, ones, ones, flag, None, voxel, 0.0018, (16, 16, 8)
-    )
+    grid, moved = Grid((5, 1, 1), (0.8, 0.8, 0.8), (0.0, 0.0, 0.0)), np.tile([1.0, -2.0, 0.5], (1, 1, 5, 1))
+    field = field_on(grid, moved, flag, voxel_mm=(0.1, 0.1, 0.2), dt_s=0.0018)
     # One voxel of 0.1 mm in 1.8 ms is 0.0556 m/s; along z the voxel is twice as long.
     np.testing.assert_allclose(field.velocity[0, 0, 0], [0.1e-3 / 0.0018, -0.2e-3 / 0.0018, 0.1e-3 / 0.0018])
     assert np.array_equal(np.isfinite(field.velocity[0, 0, :, 0]), [True, True, True, False, False])

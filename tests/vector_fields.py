@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lfpiv_cli.arrays import Floats
 from lfpiv_cli.flow.field import VALID, VectorField
@@ -15,22 +16,23 @@ VOXEL_MM = (0.1, 0.2, 0.3)
 SIGMA_VOXEL = np.array([0.05, 0.02, 0.4])
 
 
+def field_on(
+    grid: Grid,
+    displacement_voxel: Floats,
+    flag: NDArray[np.uint8] | None = None,
+    sigma_voxel: Floats | None = None,
+    voxel_mm: tuple[float, ...] = (0.1,) * 3,
+    dt_s: float = 1e-3,
+) -> VectorField:
+    """Return a field on a grid, of windows of 8 voxels; valid where nothing else is said."""
+    ones, flag = np.ones(grid.shape_zyx), np.full(grid.shape_zyx, VALID, np.uint8) if flag is None else flag
+    moved = displacement_voxel
+    return VectorField(grid, moved, moved, ones, ones, ones, flag, sigma_voxel, voxel_mm, dt_s, (8, 8, 8))
+
+
 def field_of(moved_mm: Floats, sigma_voxel: Floats | None) -> VectorField:
-    ones = np.ones(SHAPE)
     sigma = None if sigma_voxel is None else np.broadcast_to(sigma_voxel, (*SHAPE, 3)).copy()
-    return VectorField(
-        Grid(SHAPE[::-1], SPACING_MM, (-4.0, 1.0, 2.0)),
-        moved_mm / VOXEL_MM,
-        moved_mm / VOXEL_MM,
-        ones,
-        ones,
-        ones,
-        np.full(SHAPE, VALID, np.uint8),
-        sigma,
-        VOXEL_MM,
-        1e-3,
-        (8, 8, 8),
-    )
+    return field_on(Grid(SHAPE[::-1], SPACING_MM, (-4.0, 1.0, 2.0)), moved_mm / VOXEL_MM, None, sigma, VOXEL_MM)
 
 
 def places_mm() -> Floats:
