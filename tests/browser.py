@@ -1,7 +1,5 @@
 """A page opened in headless Chromium, spoken to over its debugging pipe: what it loads, shows and prints."""
 
-from __future__ import annotations
-
 import base64
 import json
 import os

@@ -1,7 +1,5 @@
 """Files of frames as cameras write them, byte by byte from the formats' descriptions and apart from what reads them."""
 
-from __future__ import annotations
-
 import struct
 import zlib
 from collections.abc import Sequence

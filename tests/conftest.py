@@ -1,7 +1,5 @@
 """Fixtures shared by all tests: cameras in both lattice kinds, media, weights and frames of the sample, the data."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable
 from contextlib import AbstractContextManager, contextmanager

@@ -1,7 +1,5 @@
 """Rays followed in other ways than the package does, to compare with, and the tube that they go through."""
 
-from __future__ import annotations
-
 import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike

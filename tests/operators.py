@@ -1,7 +1,5 @@
 """What every operator of weights has to hold, and columns as images."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

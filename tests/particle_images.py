@@ -1,7 +1,5 @@
 """Images of particles whose places are known, and what of them is found: for the tests of searches."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

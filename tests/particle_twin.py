@@ -9,8 +9,6 @@ Axes: image axes, mm; see `particles.view`. An *entry* is the meeting of a pixel
 micro-images can have two.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What other programs read of an export is what the file holds, to the last bit: a reader for each format."""
 
-from __future__ import annotations
-
 import csv
 import json
 from pathlib import Path

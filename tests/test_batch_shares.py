@@ -1,7 +1,5 @@
 """Batches divided among jobs and workers: the same files, byte for byte, as of one command."""
 
-from __future__ import annotations
-
 import json
 import shlex
 from pathlib import Path

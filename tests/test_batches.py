@@ -1,7 +1,5 @@
 """Batches through the real commands: what is skipped, fails, is listed, is shared by two workers; and dry runs."""
 
-from __future__ import annotations
-
 import json
 import os
 import shlex

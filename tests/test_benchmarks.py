@@ -1,7 +1,5 @@
 """The benchmarks at a tiny size."""
 
-from __future__ import annotations
-
 import json
 import random
 import re

@@ -1,7 +1,5 @@
 """Boards: their poses against boards rendered ray by ray, and rays fitted to several against rays that were traced."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The Cramer-Rao bound against finite differences, the inverse of the whole matrix, and fits to many noisy images."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

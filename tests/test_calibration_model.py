@@ -1,7 +1,5 @@
 """The calibration as one thing: Eq. 21, what goes into a file and comes back, what the camera takes from it."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import fields, replace
 from pathlib import Path

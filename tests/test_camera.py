@@ -1,7 +1,5 @@
 """The camera of Table 2, by hand: its lengths, pixels and axes; and the lattice of its lenses, by brute force."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Commands given cameras' own files do what they do with TIFF, bit for bit; and take the time between frames there."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from itertools import pairwise

@@ -1,7 +1,5 @@
 """The whole chain on the shipped sample: by commands, against the sample's truth; from Python, as by commands."""
 
-from __future__ import annotations
-
 import inspect
 import json
 import pydoc

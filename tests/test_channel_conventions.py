@@ -4,8 +4,6 @@ Each test shows what its convention is worth: the pictures agree with ours, and 
 turned round. Nothing here uses a picture of our own as the truth.
 """
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import dataclass

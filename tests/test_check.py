@@ -1,7 +1,5 @@
 """What `check` says of rigs and images: ten good ones, ten bad ones, and what its figures are worth."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """The process around the commands: exit codes, signals, closed pipes, start-up, a place for compiled kernels."""
 
-from __future__ import annotations
-
 import os
 import re
 import signal

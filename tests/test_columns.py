@@ -1,7 +1,5 @@
 """Columns on demand and kept: adjointness in both kinds of lattice, agreement of the operators, lines of sight."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

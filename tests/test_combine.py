@@ -1,7 +1,5 @@
 """The vectorised inner loop against its plain twin, and the benchmarks at a tiny size."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numba import njit

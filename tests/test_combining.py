@@ -1,7 +1,5 @@
 """Two fields of one flow combined: no worse than the better one, honest about its errors, and not led astray."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The configuration: what is refused, where the message points, and what the core gets."""
 
-from __future__ import annotations
-
 import json
 import re
 import time

@@ -1,7 +1,5 @@
 """What a person, a log and a script are told while a command runs and at its end."""
 
-from __future__ import annotations
-
 import importlib
 import json
 import os

@@ -1,7 +1,5 @@
 """Displacements of known particle volumes: signs, sub-voxel accuracy, borders, odd windows, empty volumes."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 

@@ -1,7 +1,5 @@
 """Images through curved windows: against plane layers, aimed rays one by one, and what a rim hides."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import replace

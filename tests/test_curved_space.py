@@ -1,7 +1,5 @@
 """Rays through curved faces against plane layers, conserved quantities, and what lenses are known to do."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import partial
 

@@ -1,7 +1,5 @@
 """Weights behind curved faces: columns against counted rays, strips against columns, the fluid's end, files."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import pairwise
 

@@ -1,7 +1,5 @@
 """Batches on Dask's workers: the same files as without, a killed worker loses nothing, what kills workers is named."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

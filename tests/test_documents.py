@@ -4,8 +4,6 @@ Each page runs in a folder of its own that holds the sample under the names that
 and what the chain makes of it, so that a page can begin anywhere. Small configs stand in for those of the paper's size.
 """
 
-from __future__ import annotations
-
 import contextlib
 import csv
 import glob

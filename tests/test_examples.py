@@ -4,8 +4,6 @@ A fake `sbatch` runs the jobs of an array one after the other, or one job in the
 Snakemake, where it is installed. Of the image's definition the commands are run that need no image.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import re

@@ -1,7 +1,5 @@
 """`export`: what its formats have of their own; that each comes back to the last bit `test_matrix` holds."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

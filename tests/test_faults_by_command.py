@@ -1,7 +1,5 @@
 """Faults around whole commands: full disks, too little memory, kills, odd names, two at once, one bad frame of many."""
 
-from __future__ import annotations
-
 import errno
 import os
 import re

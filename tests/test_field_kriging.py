@@ -1,7 +1,5 @@
 """Fields kriged as vectors, tracks drawn without images, turbulence: what must come out, and stated errors."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Accelerations of trajectories, and pressures whose gradients they are."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

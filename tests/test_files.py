@@ -1,7 +1,5 @@
 """Files in and out: what is refused, what survives faults, and what other programs see."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

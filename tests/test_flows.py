@@ -1,7 +1,5 @@
 """Known flows: what the equations of motion and the given parameters demand of them."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.integrate import quad, solve_ivp

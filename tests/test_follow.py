@@ -1,7 +1,5 @@
 """`follow` as a command and in memory: a small sequence whose tracks are known, interrupted and gone on with."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from contextlib import AbstractContextManager

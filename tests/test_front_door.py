@@ -1,7 +1,5 @@
 """What stands at the door: version, citation, the guide for contributors, the workflow."""
 
-from __future__ import annotations
-
 import ast
 import re
 import tomllib

@@ -1,7 +1,5 @@
 """Surfaces given by their heights, beside the surfaces that these were taken from; and what is no grid of heights."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Image files: every kind that is read, and what is damaged, absurd or no counts, through the commands that read it."""
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import json

@@ -1,7 +1,5 @@
 """What is taken off a raw image and which of its pixels are not believed."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy import ndimage

@@ -1,7 +1,5 @@
 """The house rule: imports only point back along the way of the light and then of the data."""
 
-from __future__ import annotations
-
 import ast
 from collections.abc import Iterator
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`lfpiv info`: what a file holds, and the picture of one voxel's column."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A configuration to begin with: what it is made from, that it holds, and its schema."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -4,8 +4,6 @@ Interpreted (`NUMBA_DISABLE_JIT=1`, `make test-interpreted`), readable twins sta
 and an index outside an array is an error.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from inspect import isfunction
 

@@ -1,7 +1,5 @@
 """The lattice fit against spots on known lattices, and against photographs."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Lens images that have moved since the calibration, told by a picture's light; and what else that light tells."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

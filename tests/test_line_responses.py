@@ -1,7 +1,5 @@
 """Line responses: the light of particles as waves, against images of waves that are propagated whole."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

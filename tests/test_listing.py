@@ -1,7 +1,5 @@
 """Inputs by the thousand, in their order; what pairs frames before their names; frames beside one that is lost."""
 
-from __future__ import annotations
-
 import io
 from pathlib import Path
 from types import SimpleNamespace

@@ -1,7 +1,5 @@
 """Gauss-Newton steps: against least squares voxel by voxel, on elongated particles, and their uncertainty."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter, shift

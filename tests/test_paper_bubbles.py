@@ -1,7 +1,5 @@
 """Parts of the paper's report: bubbles on a channel's wall, what a mask finds of them; how well depth can be told."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """What the light of particles tells beside their places: errors that they share, their number, microlenses' focus."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

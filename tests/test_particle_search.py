@@ -1,7 +1,5 @@
 """Searches: sweeps over what has changed end where those over all do; a tracer found twice is joined, two are not."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What results do of themselves in Python: describe, save and draw themselves, and give labelled arrays and tables."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 from typing import Any

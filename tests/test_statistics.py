@@ -1,7 +1,5 @@
 """Statistics over many pairs against ensembles whose moments, noise and memory are known."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

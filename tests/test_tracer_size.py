@@ -1,7 +1,5 @@
 """The tracers' diameter and the sensor's diffusion by images: what is true comes out, and what contradicts is told."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from types import SimpleNamespace
 

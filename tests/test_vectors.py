@@ -1,7 +1,5 @@
 """Vector fields: units, flags, what is derived of them, what they say against their own vectors; and masks by walls."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

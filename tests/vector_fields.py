@@ -1,7 +1,5 @@
 """Vector fields made of a flow and of noise of stated size."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

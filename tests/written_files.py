@@ -1,7 +1,5 @@
 """A file of each kind that commands write, written by the commands themselves: the whole chain on a small rig."""
 
-from __future__ import annotations
-
 import re
 import shlex
 import shutil
