@@ -1,12 +1,28 @@
-"""What is taken off a raw image and which of its pixels are not believed."""
+"""What is taken off a raw image, haze among it, and which of its pixels are not believed."""
+
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy import ndimage
 
+from lfpiv_cli.calibration.model import Calibration
+from lfpiv_cli.calibration.rectification import Rectification
+from lfpiv_cli.calibration.sheet import sheet_fit
 from lfpiv_cli.errors import InputError
+from lfpiv_cli.files.images import read_image, write_tiff
+from lfpiv_cli.files.vtkhdf import open_volume
+from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.optics.media import Media
+from lfpiv_cli.particles.noise import Noise
+from lfpiv_cli.particles.view import raw_view
 from lfpiv_cli.reconstruction import images
+from lfpiv_cli.reconstruction.haze import Haze, White
 from lfpiv_cli.reconstruction.images import as_if_lit, defects, filled, light, noise_residual, saturated, touched
+from lfpiv_cli.synthetic.render import Readout, render_white
+from tests.commands import AT_FOCUS, SAMPLE, run, sample_rig, told
+from tests.particle_images import light_on
 
 
 def test_light_takes_off_dark_or_background_and_survives_broken_pixels():
@@ -73,3 +89,120 @@ def test_noise_alone_leaves_this_residual(rng):
     # without the photons of a count only the read noise is known
     assert noise_residual(recorded.astype(np.float32)) == pytest.approx(6.0 * 400 / np.linalg.norm(recorded), rel=0.02)
     assert noise_residual(np.zeros((3, 3), np.float32)) == 0.0
+
+
+DEPTHS_MM, LIGHT_COUNTS = (-1.5, 2.5), 5e5
+# Read noise twice: of a frame and of its dark image.
+PHOTONS_PER_COUNT = 0.5
+READOUT = Readout(PHOTONS_PER_COUNT, read_noise_counts=8.5, dark_level_counts=0.0)
+BACKGROUND = (0.0, 8.5)
+
+
+def white_of(camera: Camera, rng: np.random.Generator) -> tuple[np.ndarray, White]:
+    """Return uniform light as it is, and what a noisy white image tells of it."""
+    true = render_white(camera, 1.0, samples_per_side=4)
+    photographed = READOUT.record(28_000.0 * true, rng).astype(np.float32) / 28_000.0
+    rectification = Rectification(sheet_fit(camera), true.shape)
+    white = White.of(Calibration(rectification, photographed, white=photographed))
+    assert white is not None
+    return true, white
+
+
+def tracers(camera: Camera, media: Media, per_lens: float, rng: np.random.Generator) -> np.ndarray:
+    """Return the expected image of tracers at random; so many for each microlens, and around what is seen."""
+    half = 0.6 * camera.pixel_mm * np.array([camera.columns, camera.rows])
+    number = round(per_lens * 4.0 * float(np.prod(half)) / camera.lattice.cell_area)
+    places = rng.uniform((*-half, DEPTHS_MM[0]), (*half, DEPTHS_MM[1]), (number, 3))
+    balls = np.column_stack([places, LIGHT_COUNTS * rng.uniform(0.6, 1.4, number)])
+    image = light_on(raw_view(camera, media, 0.025), balls, DEPTHS_MM)
+    return image.reshape(camera.rows, camera.columns)
+
+
+def uneven(shape: tuple[int, int], level: float, rng: np.random.Generator) -> np.ndarray:
+    """Return light that varies by a factor of two over the sensor, brightest somewhere in it."""
+    y, x = (np.linspace(-1.0, 1.0, n) - rng.uniform(-0.5, 0.5) for n in shape)
+    return level * (0.7 + 0.7 * np.exp(-(x**2) - y[:, np.newaxis] ** 2))
+
+
+def seen(image: np.ndarray, white: White, rng: np.random.Generator) -> Haze | None:
+    """Return the haze in what a sensor records of an expected image."""
+    recorded = READOUT.record(image + 100.0, rng).astype(np.float32) - 100.0
+    return white.haze_in(recorded, np.ones(image.shape, np.bool_), BACKGROUND)
+
+
+@pytest.mark.parametrize("level", [100.0, 1500.0])
+def test_uneven_haze_is_found_to_some_per_cent(camera: Camera, water: Media, rng: np.random.Generator, level: float):
+    camera = replace(camera, columns=400, rows=320)
+    true, white = white_of(camera, rng)
+    for per_lens in (0.05, 0.4, 0.8):
+        haze = uneven(true.shape, level, rng)
+        found = seen(tracers(camera, water, per_lens, rng) + haze * true, white, rng)
+        assert found is not None
+        middle = true > 0.95
+        # Of a pixel's own noise it is a fraction, and most of that lies where tracers leave few pixels dark.
+        noise = np.sqrt(BACKGROUND[1] ** 2 + haze[middle] / PHOTONS_PER_COUNT)
+        off = np.abs(found.image - haze * true)[middle] / noise
+        assert np.median(off) < 0.6
+        assert np.percentile(off, 95.0) < 2.0
+        assert found.level_counts == pytest.approx(np.median(haze), rel=0.06)
+
+
+def test_haze_fainter_than_a_pixel_s_noise_is_found(camera: Camera, water: Media, rng: np.random.Generator):
+    """Over the pixels that a tracer lights it adds up."""
+    camera = replace(camera, columns=400, rows=320)
+    true, white = white_of(camera, rng)
+    for per_lens in (0.05, 0.4, 0.8):
+        found = seen(tracers(camera, water, per_lens, rng) + 12.0 * true, white, rng)
+        assert found is not None
+        # Of noise of 16 counts; known to a fifth of it.
+        assert found.level_counts == pytest.approx(12.0, abs=3.0)
+
+
+@pytest.mark.parametrize("photons_per_count", [0.5, 0.01])
+def test_tracers_are_no_haze_however_many(
+    camera: Camera, water: Media, rng: np.random.Generator, photons_per_count: float
+):
+    """Of four for each microlens a third of the light is in the darkest pixels of all."""
+    camera = replace(camera, columns=400, rows=320)
+    _, white = white_of(camera, rng)
+    readout = replace(READOUT, photons_per_count=photons_per_count)
+    for per_lens in (0.05, 0.6, 1.3, 1.6, 2.0, 4.0, 6.0):
+        image = readout.record(tracers(camera, water, per_lens, rng) + 100.0, rng).astype(np.float32) - 100.0
+        assert white.haze_in(image, np.ones(image.shape, np.bool_), BACKGROUND) is None, per_lens
+
+
+def test_another_dark_level_is_no_haze(table2: Camera, water: Media, rng: np.random.Generator):
+    """It does not follow the lens images."""
+    camera = replace(table2, columns=400, rows=320)
+    true, white = white_of(camera, rng)
+    image = READOUT.record(tracers(camera, water, 0.2, rng) + 100.0, rng).astype(np.float32)
+    assert white.haze_in(image, np.ones(true.shape, np.bool_), (100.0, BACKGROUND[1])) is None
+
+
+def test_noise_of_dark_pixels_holds_the_haze_s_shot_noise():
+    noise = Noise(6.0, 2.0, 0.0)
+    assert noise.of_dark(None) == 6.0
+    assert noise.of_dark(np.array([1000.0, 2000.0])) == pytest.approx(np.sqrt(36.0 + 2.0 * 1500.0))
+
+
+def test_reconstruct_takes_haze_off_and_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    rig = sample_rig(tmp_path, AT_FOCUS, ("shape_xyz: [30, 22, 40]", "shape_xyz: [8, 6, 12]"))
+    pictures = {name: read_image(SAMPLE / f"{name}.tif").astype(np.float64) for name in ("white", "dark", "pair_a")}
+    light = pictures["white"] - pictures["dark"]
+    hazy = pictures["pair_a"] + uneven(light.shape, 1000.0, np.random.default_rng(1)) * light / light.max()
+    write_tiff(tmp_path / "hazy.tif", np.rint(hazy).clip(0.0).astype(np.uint16), overwrite=False)
+    calibration, made = tmp_path / "calibration.h5", tmp_path / "weights.h5"
+    dark = ("--dark", SAMPLE / "dark.tif")
+    run("calibrate-snapshot", rig, "--white", SAMPLE / "white.tif", *dark, "-o", calibration, "-q")
+    run("build-weights", rig, "--calibration", calibration, "-o", made, "-q")
+    volumes = {}
+    for frame, expected in ((SAMPLE / "pair_a.tif", []), (tmp_path / "hazy.tif", ["haze"])):
+        output = tmp_path / f"{frame.stem}.vtkhdf"
+        few = ("--solver", "sart", "--iterations", "2", "-o", output)
+        summary = told(capsys, "reconstruct", made, frame, *dark, *few)
+        assert [each["code"] for each in summary["warnings"] if each["code"] == "haze"] == expected
+        volumes[frame.stem] = open_volume(output)
+    clear, cleared = (volumes[name].array for name in ("pair_a", "hazy"))
+    assert np.linalg.norm(cleared - clear) < 0.3 * np.linalg.norm(clear)
+    assert volumes["hazy"].attributes["haze_counts"] == pytest.approx(900.0, rel=0.3)
+    assert "haze_counts" not in volumes["pair_a"].attributes
