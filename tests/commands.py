@@ -10,13 +10,11 @@ import yaml
 
 from lfpiv_cli.cli.main import cli
 from lfpiv_cli.errors import InputError
+from lfpiv_cli.optics.media import Media
 
 ROOT = Path(__file__).parent.parent
-
-
 SAMPLE, CONFIG = ROOT / "sample_data", ROOT / "configs" / "sample.yaml"
-
-
+WATER = Media(1.0, 1.49, 1.33)
 # Of the sample's text: with it no calibration is needed.
 AT_FOCUS = ("reference: mid_plane", "reference: focal_point")
 

@@ -21,7 +21,7 @@ IMAGES = 150
 STEPS = 2
 
 
-@pytest.fixture(scope="module", params=["square", "hexagonal", "waves"])
+@pytest.fixture(scope="module", params=["square", "hexagonal", pytest.param("waves", marks=pytest.mark.thorough)])
 def view(request: pytest.FixtureRequest) -> View:
     """The paper's camera with a small sensor, either kind of array, seen through distortion; and by waves."""
     by_waves = request.param == "waves"

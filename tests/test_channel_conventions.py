@@ -20,9 +20,9 @@ from lfpiv_cli.synthetic import board as board_module
 from lfpiv_cli.synthetic.board import BoardPlacement, render_board
 from lfpiv_cli.synthetic.flows import advect, square_duct
 from lfpiv_cli.synthetic.render import Balls, render_points, render_white
+from tests.commands import WATER
 from tests.known_rays import slopes_equivalent
 
-WATER = Media(1.0, 1.49, 1.33)
 AIR = ObjectSpace(Media())
 TRACER_MM = 0.05
 MEAN_M_S = 0.1082

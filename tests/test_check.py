@@ -33,8 +33,8 @@ from lfpiv_cli.verbs.check import Pictures, image_lines, lattice_of
 from lfpiv_cli.verbs.checks import Line, worst
 from lfpiv_cli.verbs.particles import light_of
 from lfpiv_cli.verbs.planning import believed_line, bench_of, diffraction_line, rig_figures, rig_lines, windows_line
+from tests.commands import WATER
 
-WATER = Media(1.0, 1.49, 1.33)
 Tree = dict[str, Any]
 Image = Singles
 

@@ -20,10 +20,10 @@ from lfpiv_cli.grid import Reference
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import fluid_path_to_focus
 from lfpiv_cli.verbs.reconstruct import ReconstructOptions
-from tests.commands import CONFIG, sample_rig
+from tests.commands import CONFIG, ROOT, sample_rig
 from tests.hostile_files import ended
 
-CONFIGS = sorted((Path(__file__).parents[1] / "configs").glob("*.yaml"))
+CONFIGS = sorted((ROOT / "configs").glob("*.yaml"))
 
 RIG = """\
 camera:

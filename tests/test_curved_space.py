@@ -19,9 +19,9 @@ from lfpiv_cli.optics.tracing import ObjectSpace, disc_points, trace
 from lfpiv_cli.synthetic import rays as of_rays
 from lfpiv_cli.synthetic.rays import FITTED, SEQUENCE, TERMS, TOLERANCE_MM, fit_of_slopes, fitted_slopes, unseen
 from lfpiv_cli.synthetic.render import Balls, render_points
+from tests.commands import WATER
 from tests.known_rays import assert_rays_go_back, rays_from_air, rays_to_air, slopes_exact, tube_of
 
-WATER = Media(1.0, 1.49, 1.33)
 # An acrylic tube: inner diameter 10 mm, wall 2 mm.
 OUTER_MM, INNER_MM = 7.0, 5.0
 tube = partial(tube_of, WATER)

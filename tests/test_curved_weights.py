@@ -304,6 +304,15 @@ def test_a_weights_file_holds_them(table2, tube, tmp_path, operator_kind):
     assert (notice.code, notice.measured) == ("weights-inexact", 0.05)
 
 
+@pytest.fixture(scope="module")
+def strips(table2, water, tmp_path_factory):
+    """A file of weights in strips."""
+    path, camera = tmp_path_factory.mktemp("strips") / "weights.h5", replace(table2, columns=300)
+    weights = Weights(BESIDE, (0, 0, 0), operator_of(camera, tube_of(water), BESIDE), "x")
+    write_weights(path, WeightsFile(weights, camera, Reference("focal_point", 0.0), {}), False)
+    return path
+
+
 @pytest.mark.parametrize(
     ("group", "name", "value"),
     [
@@ -318,17 +327,13 @@ def test_a_weights_file_holds_them(table2, tube, tmp_path, operator_kind):
         ("strips", "lit", np.ones((1, 2, 3), np.uint8)),
     ],
 )
-def test_strips_that_contradict_themselves_are_refused(table2, tube, tmp_path, group, name, value):
-    path, edited = tmp_path / "weights.h5", tmp_path / "edited.h5"
-    camera = replace(table2, columns=300)
-    weights = Weights(BESIDE, (0, 0, 0), operator_of(camera, tube, BESIDE), "x")
-    write_weights(path, WeightsFile(weights, camera, Reference("focal_point", 0.0), {}), False)
-    tree, provenance = read_tree(path, FORMAT, VERSION)
+def test_strips_that_contradict_themselves_are_refused(strips, tmp_path, group, name, value):
+    tree, provenance = read_tree(strips, FORMAT, VERSION)
     tree[group][name] = tree[group][name] + int(value.split()[-1]) if isinstance(value, str) else value
     form = {"format_name": FORMAT, "format_version": VERSION, "units": UNITS}
-    write_tree(edited, tree, **form, provenance=provenance, overwrite=False)
+    write_tree(tmp_path / "edited.h5", tree, **form, provenance=provenance, overwrite=False)
     with pytest.raises(InputError, match="not a whole weights file"):
-        open_weights(edited)
+        open_weights(tmp_path / "edited.h5")
 
 
 @pytest.mark.parametrize(

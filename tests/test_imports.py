@@ -6,7 +6,9 @@ from pathlib import Path
 
 import pytest
 
-PACKAGE = Path(__file__).parents[1] / "lfpiv_cli"
+from tests.commands import ROOT
+
+PACKAGE = ROOT / "lfpiv_cli"
 # From the scene to the shell; what stands on one line may not know of a later line.
 LAYERS = (
     {"arrays", "errors", "grid", "names", "neighbourhoods", "notice", "results", "robust", "threads"},

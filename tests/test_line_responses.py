@@ -9,15 +9,15 @@ from lfpiv_cli.arrays import Floats
 from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.optics.camera import Camera, Lattice
 from lfpiv_cli.optics.line_responses import PHASES, LineResponses
-from lfpiv_cli.optics.media import Media, Window
+from lfpiv_cli.optics.media import Window
 from lfpiv_cli.optics.tracing import ObjectSpace
 from lfpiv_cli.optics.waves import Waves, WavesInCamera
 from lfpiv_cli.particles.least_squares import respond_all, room_for
 from lfpiv_cli.particles.view import Light, View, entry_capacity, raw_view
+from tests.commands import WATER
 
 PIXELS, GREEN_MM, DIFFUSION_PX = 240, 532e-6, 0.3
 DEPTHS = (-0.5, 4.5)
-WATER = Media(1.0, 1.49, 1.33)
 SPACE = ObjectSpace(WATER, refraction="paraxial")
 POINTS = ((0.02, 0.013, 4.0), (-0.03, 0.041, 1.7), (0.012, -0.024, 0.5))
 

@@ -6,7 +6,6 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from itertools import takewhile
-from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
 
 import click
@@ -22,8 +21,8 @@ from lfpiv_cli.names import BoardMethod, Divergence, ExportFormat, GridMethod, K
 from lfpiv_cli.notice import written
 from lfpiv_cli.reconstruction.registry import PARTICLES, SOLVER_NAMES, SOLVERS
 from lfpiv_cli.synthetic.flows import FLOWS
+from tests.commands import ROOT
 
-ROOT = Path(__file__).parents[1]
 TABLE2 = ROOT / "configs" / "table2.yaml"
 # Documents that may list names: README, the guide for contributors, and the pages.
 DOCUMENTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -171,7 +170,7 @@ def test_every_solver_has_its_step_and_names_load_nothing_heavy() -> None:
     assert not {"numpy", "numba", "pydantic", "scipy"} & set(loaded.split())
 
 
-PACKAGE = Path(__file__).parents[1] / "lfpiv_cli"
+PACKAGE = ROOT / "lfpiv_cli"
 # What becomes part of a file's name, or a number again.
 NOT_FOR_PEOPLE = {"paper/sensitivities.py", "pictures/vectors.py"}
 TABLE = [

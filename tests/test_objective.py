@@ -25,10 +25,9 @@ from lfpiv_cli.synthetic.board import BoardPlacement, render_board
 from lfpiv_cli.synthetic.rays import objective_of, passed_light, passes_barrel, trace_real_ray
 from lfpiv_cli.synthetic.render import Balls, render_points, render_white
 from lfpiv_cli.verbs.simulate import real_camera
-from tests.commands import run, table2_rig
+from tests.commands import CONFIG, WATER, run, table2_rig
 from tests.known_rays import slopes_equivalent, slopes_exact
 
-SAMPLE = Path(__file__).parent.parent / "configs" / "sample.yaml"
 AIR = ObjectSpace(Media(), None, "paraxial")
 # Samples along each side of a white image's pixel.
 SAMPLES = 4
@@ -188,7 +187,7 @@ def test_prints_are_shown_by_falloff_alone(small: Camera, strengths: dict[str, f
 def test_waves_are_refused_where_rays_alone_are_rendered(tmp_path: Path, strength: str) -> None:
     rig = tmp_path / "rig.yaml"
     scene = f"simulation:\n  light: {{kind: waves}}\n  objective: {{{strength}}}\n"
-    rig.write_text(SAMPLE.read_text().replace("simulation:\n", scene))
+    rig.write_text(CONFIG.read_text().replace("simulation:\n", scene))
     with pytest.raises(ConfigError, match="simulation.objective: vignetting and array_tilt_deg"):
         real_camera(load_rig(rig))
 
@@ -197,7 +196,6 @@ F_1, F_2 = 150.0, 150.0
 # From the front lens to the object in focus, mm.
 TO_FOCUS = 200.0
 S_MU, F_MU, PIXEL, PITCH = 0.8, 0.75, 0.01, 0.1
-WATER = Media(1.0, 1.49, 1.33)
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,7 @@ from lfpiv_cli.reconstruction.images import LARGEST_STILL, still_light
 from lfpiv_cli.reconstruction.solvers import SolverSettings
 from lfpiv_cli.synthetic.render import Readout
 from lfpiv_cli.synthetic.scenes import Box, Bubbles, bubbles_at_wall, channel_walls, render_bubbles
-from tests.commands import SAMPLE, run, sample_weights
+from tests.commands import SAMPLE, WATER, run, sample_weights
 
 AIR = ObjectSpace(Media())
 MARGIN_PX = 3
@@ -172,9 +172,6 @@ def test_bubbles_that_a_mask_does_not_make_good_miss_the_limit() -> None:
     assert [row.verdict for row in _rows(found)] == ["met", "met"]
     assert [row.verdict for row in _rows(found | {"mask": found["paper"]})] == ["missed", "missed"]
     assert [row.ert for row in _rows(found)] == pytest.approx([40.0, 40.0])
-
-
-WATER = Media(1.0, 1.49, 1.33)
 
 
 @pytest.fixture

@@ -31,9 +31,9 @@ from lfpiv_cli.validation.board import MEASURES
 from lfpiv_cli.validation.flow import PAPER_OVERALL, PAPER_SLICES, Duct, Measured
 from lfpiv_cli.validation.methods import profile_at, slice_at
 from lfpiv_cli.verbs.simulate import board_depths
+from tests.commands import ROOT
 from tests.vector_fields import field_on
 
-ROOT = Path(__file__).parents[1]
 TINY = PaperOptions(size="tiny")
 QUIET = Console(quiet=True)
 GOOD = Row(quantity="error <of> a|b (mm)", source="Table 9", limit=0.2, paper_ert=0.2, best=0.1)

@@ -19,11 +19,9 @@ from lfpiv_cli.files.particles import read_particles
 from lfpiv_cli.files.vtkhdf import open_vectors
 from lfpiv_cli.grid import Reference
 from lfpiv_cli.validation.volume import particle_figures
-from tests.commands import run
+from tests.commands import CONFIG, SAMPLE, run
 
-ROOT = Path(__file__).parent.parent
 LOW, HIGH = (-1.5, -1.1, -2.0), (1.5, 1.1, 2.0)
-SAMPLE, CONFIG = ROOT / "sample_data", ROOT / "configs" / "sample.yaml"
 
 
 def weights_of(config: Path, images: Path, folder: Path) -> Path:

@@ -21,6 +21,7 @@ from lfpiv_cli.pictures import vectors as pictures
 from lfpiv_cli.pictures.statistics import convergence_figure
 from lfpiv_cli.pictures.style import COLOURS, MARKERS, SETTINGS, SLABS, percentiles_by_depth, scale_of, symmetric_limit
 from lfpiv_cli.verbs.plot import figures_of
+from tests.commands import CONFIG
 from tests.known_rays import tube_of
 
 matplotlib = pytest.importorskip("matplotlib")
@@ -179,7 +180,6 @@ def test_the_style_holds_within_and_leaves_the_callers_settings() -> None:
 
 
 AT_FOCUS = Reference("focal_point", 0.0)
-SAMPLE = Path(__file__).parents[1] / "configs" / "sample.yaml"
 SHAPE = (5, 4, 3)  # z, y, x
 
 
@@ -312,7 +312,7 @@ def test_figures_of_a_file_follow_what_it_knows(field: Floats, tmp_path: Path) -
     np.testing.assert_array_equal(image_of(panels(drawn)[0]), varied.correlation[2])
     assert len(figures["displacements"].draw().axes) == 6
     # With the camera known, what displacements are beyond whole microlenses (0.1 mm) is shown, too.
-    write_vectors(path, varied, AT_FOCUS, provenance={"config": load_rig(SAMPLE).resolved()}, overwrite=True)
+    write_vectors(path, varied, AT_FOCUS, provenance={"config": load_rig(CONFIG).resolved()}, overwrite=True)
     below = figures_of(path)["displacements"].draw().axes[-3:]
     assert [axes.get_xlabel() for axes in below] == [f"{name} beyond whole microlenses (microlenses)" for name in "uvw"]
     parts = field.displacement_voxel[field.flag == VALID][:, 0]

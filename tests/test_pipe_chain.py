@@ -21,9 +21,9 @@ from lfpiv_cli.files.weights_file import open_weights
 from lfpiv_cli.flow.field import MASKED
 from lfpiv_cli.self_calibration import refinement
 from lfpiv_cli.weights.strips import StripOperator
-from tests.commands import run
+from tests.commands import CONFIG, ROOT, SAMPLE, run
 
-CONFIGS = Path(__file__).parent.parent / "configs"
+CONFIGS = ROOT / "configs"
 # What stands in the files, and what makes of them a section of the pipe's middle on a part of the sensor.
 SMALL = {
     r"columns: 2352, rows: 1768": "columns: 1000, rows: 1000",
@@ -156,8 +156,6 @@ def test_a_pipe_that_is_not_where_it_was_said_is_found_and_measured(
     assert figures["within_25_percent_vector_inner"] > 0.98
 
 
-ROOT = Path(__file__).parent.parent
-DATA, CONFIG = ROOT / "sample_data", ROOT / "configs" / "sample.yaml"
 WRONG_MM = 0.3
 
 
@@ -165,7 +163,7 @@ WRONG_MM = 0.3
 def wrong(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The sample's calibration with its mid plane too far away."""
     folder = tmp_path_factory.mktemp("refine")
-    stills = ("--white", DATA / "white.tif", "--dark", DATA / "dark.tif", "--board", DATA / "board.tif")
+    stills = ("--white", SAMPLE / "white.tif", "--dark", SAMPLE / "dark.tif", "--board", SAMPLE / "board.tif")
     run("calibrate-snapshot", CONFIG, *stills, "-o", folder / "calibration.h5")
     right = open_calibration(folder / "calibration.h5")
     assert right.mid_plane_z_mm is not None
@@ -176,13 +174,13 @@ def wrong(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.slow
 def test_a_wrong_mid_plane_is_found_and_mended(wrong: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    image, dark = DATA / "pair_a.tif", ("--dark", DATA / "dark.tif")
+    image, dark = SAMPLE / "pair_a.tif", ("--dark", SAMPLE / "dark.tif")
     output, picture = tmp_path / "refined.h5", tmp_path / "walls.png"
     capsys.readouterr()
     targets = ("-o", output, "--picture", picture, "--json")
     run("refine-calibration", CONFIG, image, "--calibration", wrong, *dark, *targets)
     summary = json.loads(capsys.readouterr().out)
-    truth = json.loads((DATA / "particles.json").read_text())["reference_z_mm"]
+    truth = json.loads((SAMPLE / "particles.json").read_text())["reference_z_mm"]
     assert abs(summary["mid_plane_z_mm"] - truth) < 3 * summary["mid_plane_z_mm_sigma"]
     assert summary["mid_plane_z_mm_sigma"] < 0.03
     assert summary["mid_plane_correction_mm"] == pytest.approx(-WRONG_MM, abs=0.06)
@@ -233,7 +231,7 @@ def test_a_config_without_a_channel_is_refused(wrong: Path, tmp_path: Path) -> N
     lines = [line for line in CONFIG.read_text().splitlines() if not line.startswith("channel")]
     config.write_text("\n".join(lines).replace("reference: mid_plane", "reference: focal_point"))
     with pytest.raises(ConfigError, match="channel: is missing"):
-        run("refine-calibration", config, DATA / "pair_a.tif", "--calibration", wrong)
+        run("refine-calibration", config, SAMPLE / "pair_a.tif", "--calibration", wrong)
 
 
 RIG = """\

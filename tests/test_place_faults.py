@@ -19,11 +19,9 @@ from lfpiv_cli.errors import InputError
 from lfpiv_cli.files.particles import read_particles
 from lfpiv_cli.files.vtkhdf import write_vectors
 from lfpiv_cli.grid import FOCAL_POINT
+from tests.commands import CONFIG, SAMPLE
 from tests.hostile_files import ended
 from tests.vector_fields import SHAPE, field_of
-
-ROOT = Path(__file__).parent.parent
-SAMPLE, DATA = ROOT / "configs" / "sample.yaml", ROOT / "sample_data"
 
 
 @pytest.fixture(scope="module")
@@ -36,8 +34,8 @@ def vectors(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def words_of(command: str, **places: Path) -> list[str]:
     """Return the words of a command, with paths in place of their names in braces."""
-    photographs = {name: DATA / f"{name}.tif" for name in ("white", "dark", "pair_a", "pair_b")}
-    return [word.format(sample=SAMPLE, **photographs, **places) for word in command.split()]
+    photographs = {name: SAMPLE / f"{name}.tif" for name in ("white", "dark", "pair_a", "pair_b")}
+    return [word.format(sample=CONFIG, **photographs, **places) for word in command.split()]
 
 
 @pytest.mark.thorough
@@ -119,7 +117,7 @@ def test_a_command_that_fails_leaves_no_folder(tmp_path: Path, vectors: Path, co
 
 @pytest.mark.skipif(sys.platform != "linux", reason="no limit of the address space")
 def test_an_address_space_that_the_libraries_do_not_fit_into_is_told(tmp_path: Path) -> None:
-    line = f"ulimit -v 500000; exec '{sys.executable}' -m lfpiv_cli build-weights '{SAMPLE}' -o '{tmp_path}/w.h5'"
+    line = f"ulimit -v 500000; exec '{sys.executable}' -m lfpiv_cli build-weights '{CONFIG}' -o '{tmp_path}/w.h5'"
     done = subprocess.run(["bash", "-c", line], capture_output=True, text=True, timeout=60)
     assert done.returncode == 7
     assert "too little memory: the address space of this process is limited to 0.51 GB" in done.stderr
@@ -129,17 +127,17 @@ def test_too_little_memory_is_no_bug_and_an_input_that_may_not_be_read_gives_4(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     image = tmp_path / "secret.tif"
-    image.write_bytes((DATA / "white.tif").read_bytes())
+    image.write_bytes((SAMPLE / "white.tif").read_bytes())
     allowed = os.access
     # Root may read everything, and tests often run as root.
     monkeypatch.setattr(os, "access", lambda path, mode: "secret" not in str(path) and allowed(path, mode))
     for option in ((), ("--white",), ("--dark",)):
-        code, said = ended("check", SAMPLE, *option, image)
+        code, said = ended("check", CONFIG, *option, image)
         assert code == 4
         assert "secret.tif: cannot be read: permission denied" in said
     for error in (MemoryError(), MemoryError("Unable to allocate 3 GiB"), RuntimeError("can't start new thread")):
         monkeypatch.setattr("lfpiv_cli.verbs.check.check", Mock(side_effect=error))
-        code, said = ended("check", SAMPLE)
+        code, said = ended("check", CONFIG)
         assert code == 7
         assert said.startswith("too little memory: ")
 
@@ -232,7 +230,7 @@ def test_what_is_no_list_of_particles_is_refused(tmp_path: Path, harm: str) -> N
     write_vectors(vectors, field, FOCAL_POINT, provenance={}, overwrite=False)
     particles.write_bytes(HARM[harm]())
     code, said = ended(
-        "validate", "flow", SAMPLE, "--vectors", vectors, "--particles", particles, "-o", tmp_path / "report"
+        "validate", "flow", CONFIG, "--vectors", vectors, "--particles", particles, "-o", tmp_path / "report"
     )
     assert code == 4
     assert f"{particles}: " in said
@@ -281,7 +279,7 @@ def test_a_rig_file_is_written_though_nothing_can_be_said(tmp_path: Path, closed
 def test_an_answer_that_is_lost_is_a_failure_but_for_a_reader_that_has_gone(
     tmp_path: Path, closed: str, code: int
 ) -> None:
-    done = shell(f"{LFPIV} check '{SAMPLE}' --json {closed}")
+    done = shell(f"{LFPIV} check '{CONFIG}' --json {closed}")
     assert done.returncode == code
     assert ("stdout: cannot be written: No space left on device" in done.stderr) == (code == 7)
     assert "Traceback" not in done.stderr
@@ -291,7 +289,7 @@ def test_an_answer_that_is_lost_is_a_failure_but_for_a_reader_that_has_gone(
 @pytest.mark.thorough
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no device that is always full")
 def test_an_answer_goes_through_a_pipe_and_errors_keep_their_codes(tmp_path: Path) -> None:
-    done = shell(f"{LFPIV} check '{SAMPLE}' 2>/dev/null | head -1")
+    done = shell(f"{LFPIV} check '{CONFIG}' 2>/dev/null | head -1")
     assert (done.returncode, done.stderr) == (0, "")
     assert done.stdout.startswith(" ")
     assert done.stdout.count("\n") == 1

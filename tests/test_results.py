@@ -24,7 +24,7 @@ from lfpiv_cli.verbs import checks
 from lfpiv_cli.verbs.checks import FOR_INFORMATION, Line, of_two_ways, of_vectors, of_warnings, worst, worst_first
 from lfpiv_cli.verbs.plot import figures_of
 from lfpiv_cli.verbs.results import KINDS
-from tests.commands import table2_rig
+from tests.commands import ROOT, table2_rig
 from tests.vector_fields import SHAPE, SIGMA_VOXEL, VOXEL_MM, field_of, field_on, noise_mm, rotation_mm
 from tests.written_files import WrittenFiles
 
@@ -262,7 +262,7 @@ def test_info_tells_of_files_of_other_formats(tmp_path):
     assert json.loads(run("info", str(path), "--json"))["a_mm"] == "float64 [9]"
 
 
-TROUBLESHOOTING = Path(__file__).parents[1] / "docs" / "troubleshooting.md"
+TROUBLESHOOTING = ROOT / "docs" / "troubleshooting.md"
 
 
 def made(command: str, *codes: str) -> dict[str, Any]:

@@ -31,6 +31,7 @@ from lfpiv_cli.verbs.particles import searchable
 from lfpiv_cli.verbs.planning import bench_of
 from lfpiv_cli.weights.build import factorise, scene_distortion
 from lfpiv_cli.weights.model import Weights
+from tests.commands import ROOT, WATER
 from tests.known_rays import points_counted
 
 RIG = """\
@@ -47,7 +48,6 @@ scene:
   - {kind: cylinder, axis: x, radius_mm: 7.0, centre_mm: [0, 0, 0], behind: window}
   - {kind: cylinder, axis: x, radius_mm: 5.0, behind: fluid}
 """
-WATER = Media(1.0, 1.49, 1.33)
 
 
 @pytest.fixture
@@ -316,7 +316,7 @@ def test_a_point_off_the_axis_comes_back_to_its_place(
 @pytest.mark.parametrize(("name", "radius"), [("pipe", 7.0), ("pipe_box", 13.0)])
 def test_the_camera_is_moved_from_a_pipes_board_to_its_axis_as_the_recipe_says(name: str, radius: float) -> None:
     """The recipe's figures, from a board on the outermost face or in the axis's place, are the scene's own."""
-    root = Path(__file__).parent.parent
+    root = ROOT
     settings = load_rig(root / "configs" / f"{name}.yaml")
     space, camera = settings.scene_space(), settings.camera_model()
     assert space is not None

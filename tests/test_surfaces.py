@@ -27,6 +27,7 @@ from lfpiv_cli.optics.surfaces import (
     normal_change,
 )
 from lfpiv_cli.optics.tracing import disc_points
+from tests.commands import WATER
 from tests.known_rays import assert_rays_go_back, tube_of
 
 PLANE = Plane(-3.0)
@@ -164,7 +165,6 @@ def test_what_the_optical_axis_never_meets_is_refused(surface: Surface, words: s
         surface.shape()
 
 
-WATER = Media(1.0, 1.49, 1.33)
 TUBE = tube_of(WATER)
 BALL = CurvedSpace(WATER, (Face(Sphere((0.0, 0.0, 1.0), 8.0), 1.49), Face(Sphere((0.0, 0.0, 2.0), 6.5), 1.33)))
 # A hollow face in air, and a tilted plane.

@@ -21,9 +21,9 @@ from lfpiv_cli.validation.board import DEPTH_DEFINITIONS, board_figures, elongat
 from lfpiv_cli.validation.flow import limits_missed
 from lfpiv_cli.validation.volume import known_volume, match, normalised_correlation, particle_figures, volume_figures
 from lfpiv_cli.validation.weights import GREY_LEVELS, WINDOW_RADIUS_PX, Column, make_columns, ssim, weights_figures
-from tests.commands import CONFIG, run, table2_rig
+from tests.commands import CONFIG, ROOT, run, table2_rig
 
-TABLE2 = Path(__file__).parent.parent / "configs" / "table2.yaml"
+TABLE2 = ROOT / "configs" / "table2.yaml"
 BOARD_GRID = Grid.centred((30, 20, 60), (0.1, 0.1, 0.1), (0.0, 0.0, 0.0))
 DOTS = np.array([(x, y) for y in (-0.5, 0.5) for x in (-1.0, 0.0, 1.0)])
 

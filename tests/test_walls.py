@@ -1,7 +1,6 @@
 """Walls and a pipe's axis by the particles in them, put between known ones."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -21,6 +20,7 @@ from lfpiv_cli.self_calibration.refinement import Refinement
 from lfpiv_cli.self_calibration.scene_refinement import SceneRefinement, together, wall_by_places
 from lfpiv_cli.self_calibration.walls import Walls, find_round_wall, find_walls
 from lfpiv_cli.verbs.refine import scene_notices
+from tests.commands import ROOT
 from tests.known_rays import tube_of
 from tests.particle_images import light_on
 
@@ -103,7 +103,7 @@ def test_the_picture_shows_all_particles_and_both_walls(rng: np.random.Generator
     np.testing.assert_array_equal(across.lines[0].get_ydata(), position[:, 2])
 
 
-CONFIG = Path(__file__).parent.parent / "configs" / "pipe.yaml"
+CONFIG = ROOT / "configs" / "pipe.yaml"
 # 0.15 mm across, 0.2 mm towards the camera, a third and a fifth of a degree.
 TRUTH = np.array([0.15, -0.2, 5.2e-3, -3.5e-3])
 SIGMA_MM = np.array([1e-3, 2e-3, 0.012])

@@ -22,6 +22,7 @@ from lfpiv_cli.optics.tracing import ObjectSpace, disc_points
 from lfpiv_cli.optics.waves import DEGREE, Waves, WavesInCamera, pixel_response
 from lfpiv_cli.synthetic.board import BoardPlacement, render_board, sunflower
 from lfpiv_cli.synthetic.render import Balls, lens_blur_mm, lens_spread, points_in_ball, render_points, render_white
+from tests.commands import WATER
 from tests.known_rays import tube_of
 
 GREEN = Waves(532e-6)
@@ -29,7 +30,6 @@ GREEN = Waves(532e-6)
 INFRARED = Waves(2128e-6)
 NO_RAYS = np.random.default_rng(0)
 AIR = ObjectSpace(Media(), None, "paraxial")
-WATER = Media(1.0, 1.49, 1.33)
 
 
 @pytest.fixture

@@ -1,7 +1,6 @@
 """Windows: their sums written out, weighted or not; outliers among vectors, and the mean of a batch."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -21,6 +20,7 @@ from lfpiv_cli.flow.windows import WEIGHTINGS, CorrelationSettings, WindowLayout
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.names import Weighting, names_in
 from lfpiv_cli.verbs.correlate import CorrelateOptions
+from tests.commands import ROOT
 
 
 def spline(s: np.ndarray) -> np.ndarray:
@@ -91,7 +91,7 @@ def test_moments_are_those_of_gradient_mean_and_difference(rng: np.random.Genera
 
 
 HALF = (0.5, 0.5, 0.5)
-TABLE2 = Path(__file__).parents[1] / "configs" / "table2.yaml"
+TABLE2 = ROOT / "configs" / "table2.yaml"
 # An odd size, shared and unshared cells, windows that overhang and leave gaps.
 LAYOUTS = [((8, 7, 6), HALF), ((8, 8, 8), HALF), ((9, 6, 4), (0.75, 0.0, 0.5))]
 
