@@ -12,7 +12,7 @@ from lfpiv_cli.errors import InputError, PartialError, StoppedEarlyError, UsageE
 from lfpiv_cli.files import listing
 from lfpiv_cli.files.images import read_image
 from lfpiv_cli.files.shares import Deadline
-from tests.commands import SAMPLE, run
+from tests.commands import CONFIG, SAMPLE, run
 from tests.test_particle_stage import write_frame
 
 
@@ -240,6 +240,7 @@ def test_what_stays_away(volumes: list[Path], tmp_path: Path, monkeypatch: pytes
 
 
 ALONE, PAIRED = "reconstruct {weights} {folder}", "correlate {folder} --pairing ab"
+RUN = f"run '{CONFIG}' {{folder}} --white '{SAMPLE}/white.tif' --board '{SAMPLE}/board.tif' --method volumes"
 
 
 @pytest.mark.parametrize(
@@ -253,6 +254,12 @@ ALONE, PAIRED = "reconstruct {weights} {folder}", "correlate {folder} --pairing 
         (f"{PAIRED} --mean mean.vtkhdf", "--watch: --mean is made from all pairs"),
         (f"{PAIRED} --ensemble", "--watch: --ensemble is made from all pairs"),
         ("reconstruct {weights} {file}", "--watch takes folders"),
+        (f"{RUN} --follow", "separate pairs"),
+        (f"{RUN} --pairing sequence", "separate pairs"),
+        (f"{RUN} --background minimum:3", "--background minimum:3 is made from all frames"),
+        (f"{RUN} --mask still", "--mask still is made from all frames"),
+        (f"{RUN} --shard 1/2", "leave out --shard"),
+        (f"{RUN} --dry-run", "leave out one of them"),
     ],
 )
 def test_what_frames_that_come_exclude(
@@ -261,6 +268,7 @@ def test_what_frames_that_come_exclude(
     command = words.format(weights=weights, folder=tmp_path, file=frames[0])
     with pytest.raises(UsageError, match=said):
         run(*shlex.split(command), "--watch", "-o", tmp_path / "v")
+    assert not (tmp_path / "v").exists()
 
 
 @pytest.mark.slow

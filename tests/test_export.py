@@ -11,7 +11,6 @@ from scipy.io import loadmat, netcdf_file
 
 from lfpiv_cli.errors import InputError, OutputError, UsageError
 from lfpiv_cli.files import export_formats as formats
-from lfpiv_cli.files import particle_file
 from lfpiv_cli.files.export_formats import FORMATS, Content, columns_of, read_content
 from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, TRACKS_FORMAT, TRAJECTORIES_FORMAT, Points, write_points
 from lfpiv_cli.files.vtkhdf import write_vectors, write_volume
@@ -20,6 +19,7 @@ from lfpiv_cli.grid import Grid, Reference
 from lfpiv_cli.names import ExportFormat
 from tests.commands import run
 from tests.read_back import same
+from tests.vector_fields import points_of
 
 GRID = Grid((4, 3, 2), (0.1, 0.3, 0.7), (-0.15, 1 / 3, 2.0))
 REFERENCE = Reference("mid_plane", 0.1 + 0.2)
@@ -37,15 +37,9 @@ def write_field(path: Path, rng: np.random.Generator, grid: Grid = GRID, dt_s: f
     write_vectors(path, field, REFERENCE, provenance=MADE, overwrite=False, extra=extra)
 
 
-def points_of(name: str, rng: np.random.Generator) -> Points:
+def five_of(name: str, rng: np.random.Generator) -> Points:
     """Return five points; in a sequence a track of three frames and one of two, and no light in frame 1."""
-    shapes = dict.fromkeys(("velocity", "velocity_sigma", "displacement_mm"), (5, 3))
-    shapes |= dict.fromkeys(("covariance_mm2", "displacement_covariance_mm2"), (5, 6))
-    integers = {"particle", "particle_a", "particle_b"}
-    arrays: dict[str, Any] = {
-        each: rng.integers(0, 9, 5) if each in integers else rng.normal(size=shapes.get(each, (5,)))
-        for each in (*particle_file.UNITS[name], *particle_file.OPTIONAL.get(name, {}))
-    }
+    arrays: dict[str, Any] = points_of(name, rng, 5).arrays
     if name == PARTICLES_FORMAT:
         arrays["flag"] = np.array([0, 1, 0, 0, 1], np.uint8)
     else:
@@ -65,7 +59,7 @@ def write_kind(kind: str, folder: Path, rng: np.random.Generator) -> Path:
         write_field(path, rng)
     else:
         name = {"particles": PARTICLES_FORMAT, "tracks": TRACKS_FORMAT, "trajectories": TRAJECTORIES_FORMAT}[kind]
-        write_points(path, name, points_of(name, rng), overwrite=False)
+        write_points(path, name, five_of(name, rng), overwrite=False)
     return path
 
 
@@ -182,7 +176,7 @@ def test_flowtracks_reads_the_tracks_of_a_sequence(tmp_path: Path, rng: np.rando
 @pytest.mark.thorough
 @pytest.mark.parametrize("name", [PARTICLES_FORMAT, TRACKS_FORMAT, TRAJECTORIES_FORMAT])
 def test_no_points_are_no_fault(name: str, tmp_path: Path, rng: np.random.Generator) -> None:
-    full = points_of(name, rng)
+    full = five_of(name, rng)
     arrays = {each: array[:0] for each, array in full.arrays.items()}
     none = Points(np.empty((0, 3)), arrays, REFERENCE, full.attributes, MADE)
     write_points(tmp_path / "none.vtkhdf", name, none, overwrite=False)

@@ -389,17 +389,6 @@ def test_what_a_decoder_complains_of_is_a_warning(tmp_path: Path, capsys: pytest
     assert "a.tif: the decoder says: " in capsys.readouterr().err
 
 
-# Images
-
-
-def test_another_shape_is_refused_with_both(tmp_path: Path) -> None:
-    tifffile.imwrite(tmp_path / "turned.tif", np.ones((COLUMNS, ROWS), np.uint16))
-    code, said = ended("check", CONFIG, tmp_path / "turned.tif")
-    assert code == 4
-    for words in ("turned.tif", f"{ROWS} x {COLUMNS}", f"{COLUMNS} x {ROWS}"):
-        assert words in said
-
-
 @pytest.mark.parametrize("layout", [{}, {"rowsperstrip": 64}, {"tile": (64, 64)}], ids=str)
 def test_bytes_after_what_is_too_short_are_no_pixels(tmp_path: Path, layout: dict) -> None:
     path = tmp_path / "short.tif"
@@ -427,18 +416,6 @@ def test_gigabytes_of_no_image_are_refused_unread(tmp_path: Path, monkeypatch: p
     monkeypatch.setattr("lfpiv_cli.files.provenance._sha256", lambda path, *_: pytest.fail(f"{path} is hashed"))
     code, said = ended("calibrate-snapshot", CONFIG, "--white", path, "-o", tmp_path / "c.h5")
     assert (code, f"{path.name}: " in said) == (4, True), said
-
-
-@pytest.mark.thorough
-@pytest.mark.parametrize("percent", [1, 20, 40, 60, 80, 99])
-def test_no_page_of_a_cut_recording_is_lost_in_silence(tmp_path: Path, weights: Path, percent: int) -> None:
-    path = tmp_path / "cut.tif"
-    pages = np.random.default_rng(1).integers(0, 4096, (3, ROWS, COLUMNS)).astype(np.uint16)
-    tifffile.imwrite(path, pages, photometric="minisblack")
-    whole = path.read_bytes()
-    path.write_bytes(whole[: len(whole) * percent // 100])
-    code, said = ended("reconstruct", weights, path, "--iterations", 1, "-o", tmp_path / "out")
-    assert (code, "cut.tif" in said) == (4, True), said
 
 
 @pytest.mark.parametrize(("content", "words"), ABSURD_IMAGES, ids=[words for _, words in ABSURD_IMAGES])

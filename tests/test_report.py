@@ -13,7 +13,6 @@ from click.testing import CliRunner
 from lfpiv_cli.cli.main import cli
 from lfpiv_cli.console import Console
 from lfpiv_cli.errors import InputError, OutputExistsError, UsageError
-from lfpiv_cli.files import particle_file
 from lfpiv_cli.files.config import load_rig
 from lfpiv_cli.files.hdf5 import write_tree
 from lfpiv_cli.files.images import write_tiff
@@ -31,7 +30,7 @@ from lfpiv_cli.verbs.plot import figures_of
 from lfpiv_cli.verbs.report import ReportOptions, report
 from tests.browser import CHROMIUM, opened
 from tests.commands import ROOT, run, table2_rig, told
-from tests.vector_fields import SHAPE, SIGMA_VOXEL, field_of, noise_mm, rotation_mm
+from tests.vector_fields import SHAPE, SIGMA_VOXEL, field_of, noise_mm, points_of, rotation_mm
 
 QUIET = Console(quiet=True)
 REFERENCE = Reference("focal_point", 0.0)
@@ -326,9 +325,6 @@ def test_a_browser_sees_the_page_and_loads_nothing(results: Path, tmp_path: Path
 
 pytest.importorskip("matplotlib")
 
-AT_FOCUS = Reference("focal_point", 0.0)
-N = 12
-
 
 @pytest.fixture
 def config(tmp_path):
@@ -337,25 +333,12 @@ def config(tmp_path):
     return path
 
 
-def points(rng: np.random.Generator, of_format: str, provenance: dict) -> Points:
-    """Return points with every array that their format has."""
-    tensors, vectors = ("covariance_mm2",), ("velocity", "velocity_sigma", "displacement_mm")
-    arrays = {
-        name: rng.random((N, 6) if name in tensors else (N, 3) if name in vectors else N)
-        for name in particle_file.UNITS[of_format]
-    }
-    for name in ("track", "frame", "particle", "particle_a", "particle_b", "flag"):
-        if name in arrays:
-            arrays[name] = np.arange(N) // 3
-    return Points(rng.random((N, 3)), arrays, AT_FOCUS, {}, provenance)
-
-
 @pytest.fixture
 def volume(tmp_path):
     path = tmp_path / "volume.vtkhdf"
     grid = Grid.centred((2, 3, 4), (0.1, 0.1, 0.1), (0.0, 0.0, 0.0))
     array = np.arange(24.0).reshape(4, 3, 2)
-    write_volume(path, array, grid, AT_FOCUS, provenance={}, attributes={}, overwrite=True)
+    write_volume(path, array, grid, REFERENCE, provenance={}, attributes={}, overwrite=True)
     return path
 
 
@@ -387,9 +370,9 @@ def test_wrong_names_outputs_and_images_are_refused_before_drawing(volume, tmp_p
         figures_of(other)
     rng = np.random.default_rng(1)
     path = tmp_path / "t.vtkhdf"
-    write_points(path, TRACKS_FORMAT, points(rng, TRACKS_FORMAT, {}), overwrite=True)
+    write_points(path, TRACKS_FORMAT, points_of(TRACKS_FORMAT, rng), overwrite=True)
     assert list(figures_of(path)) == ["space", "velocities", "links", "sigma"]
-    write_points(path, TRAJECTORIES_FORMAT, points(rng, TRAJECTORIES_FORMAT, {}), overwrite=True)
+    write_points(path, TRAJECTORIES_FORMAT, points_of(TRAJECTORIES_FORMAT, rng), overwrite=True)
     figures = figures_of(path)
     assert list(figures) == ["space", "lengths", "velocities", "links", "sigma"]
     assert figures["space"].draw().axes[0].get_title() == "4 trajectories"
@@ -398,7 +381,7 @@ def test_wrong_names_outputs_and_images_are_refused_before_drawing(volume, tmp_p
     rng = np.random.default_rng(1)
     for what, of_format in (("tracks of a pair", TRACKS_FORMAT), ("tracks of a sequence", TRAJECTORIES_FORMAT)):
         path = tmp_path / "t.vtkhdf"
-        write_points(path, of_format, points(rng, of_format, {}), overwrite=True)
+        write_points(path, of_format, points_of(of_format, rng), overwrite=True)
         assert listed[what] == list(figures_of(path))
     assert listed["volume"] == list(figures_of(volume))
     assert len(listed) == 7
@@ -407,13 +390,15 @@ def test_wrong_names_outputs_and_images_are_refused_before_drawing(volume, tmp_p
 def test_particles_bring_their_residual_and_weights_their_middle_voxel(config, tmp_path):
     path, raw = tmp_path / "a.vtkhdf", tmp_path / "raw.tif"
     made = {"command": "reconstruct", "config": load_rig(config).resolved()}
-    write_points(path, PARTICLES_FORMAT, points(np.random.default_rng(1), PARTICLES_FORMAT, made), overwrite=True)
+    write_points(
+        path, PARTICLES_FORMAT, points_of(PARTICLES_FORMAT, np.random.default_rng(1), provenance=made), overwrite=True
+    )
     assert list(figures_of(path)) == ["places", "depths", "chi2"]
     write_tiff(tmp_path / "a_residual.tif", np.ones((200, 240), np.float32), overwrite=True)
     write_tiff(raw, np.ones((200, 240), np.uint16), overwrite=True)
     figures = figures_of(path, raw)
     assert list(figures) == ["places", "image", "residual", "depths", "chi2"]
-    assert len(figures["image"].draw().axes[0].collections[0].get_offsets()) == N
+    assert len(figures["image"].draw().axes[0].collections[0].get_offsets()) == 12
     write_tiff(raw, np.ones((20, 20), np.uint16), overwrite=True)
     with pytest.raises(InputError, match=r"raw\.tif"):
         figures_of(path, raw)

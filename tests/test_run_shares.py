@@ -61,16 +61,18 @@ def with_weights(whole: Path, tmp_path: Path) -> Path:
 
 
 @pytest.mark.thorough
-def test_shards_together_give_what_one_command_gives(rig, whole, with_weights):
-    for number in (3, 1, 2):
-        run(rig, with_weights, "--shard", f"{number}/3")
+@pytest.mark.parametrize(("order", "keep"), [((3, 1, 2), "all"), ((1, 2, 3, 4, 5), "results")])
+def test_shards_together_give_what_one_command_gives(rig, whole, with_weights, order, keep):
+    for number in order:
+        run(rig, with_weights, "--shard", f"{number}/{len(order)}", "--keep", keep)
         assert not (with_weights / "run.json").exists()
-    assert data_of(with_weights) == data_of(whole)
-    run(rig, with_weights)
+    expected = {name: data for name, data in data_of(whole).items() if keep == "all" or "volumes" not in name}
+    assert data_of(with_weights) == expected
+    run(rig, with_weights, "--keep", keep)
     told = json.loads((with_weights / "run.json").read_text())
     assert {step["state"] for step in told["steps"].values()} == {"kept"}
     assert told["figures"] == json.loads((whole / "run.json").read_text())["figures"]
-    assert data_of(with_weights) == data_of(whole)
+    assert data_of(with_weights) == expected
 
 
 @pytest.mark.thorough
@@ -87,13 +89,6 @@ def test_workers_of_a_scheduler_give_what_one_command_gives(
     for words, options in (("frame to frame", ("--follow",)), ("as it comes", ("--watch", "--idle-s", 1))):
         with pytest.raises(UsageError, match=f"--dask: .*{words}"):
             lfpiv("run", rig / "rig.yaml", rig / "images", *PHOTOGRAPHS, "--dask", "local", *options, "-o", rig / "no")
-
-
-@pytest.mark.thorough
-def test_more_shards_than_pairs_and_without_volumes(rig: Path, whole: Path, with_weights: Path) -> None:
-    for number in range(1, 6):
-        run(rig, with_weights, "--shard", f"{number}/5", "--keep", "results")
-    assert data_of(with_weights) == {name: data for name, data in data_of(whole).items() if "volumes" not in name}
 
 
 @pytest.mark.thorough

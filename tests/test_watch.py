@@ -16,7 +16,7 @@ import pytest
 import tifffile
 
 from lfpiv_cli.console import Console
-from lfpiv_cli.errors import ConfigError, InputError, PartialError, UsageError
+from lfpiv_cli.errors import ConfigError, InputError, PartialError
 from lfpiv_cli.files import listing
 from lfpiv_cli.files.batch import Frame, images_seen
 from lfpiv_cli.files.config import load_rig
@@ -259,26 +259,6 @@ def test_particles_are_those_of_run_and_pairs_wait_until_the_tracers_size_is_kno
     assert seen == [2, 4, 5]
     assert capsys.readouterr().err.count("waits for the next pair") == 2
     assert results_of(tmp_path / "out") == results_of(tmp_path / "one")
-
-
-@pytest.mark.parametrize(
-    ("options", "said"),
-    [
-        (("--follow",), "separate pairs"),
-        (("--pairing", "sequence"), "separate pairs"),
-        (("--background", "minimum:3"), "--background minimum:3 is made from all frames"),
-        (("--mask", "still"), "--mask still is made from all frames"),
-        (("--shard", "1/2"), "leave out --shard"),
-        (("--dry-run",), "leave out one of them"),
-    ],
-)
-def test_what_watching_excludes_is_refused_before_any_work(
-    rig: Path, tmp_path: Path, options: tuple[str, ...], said: str
-) -> None:
-    (tmp_path / "images").mkdir()
-    with pytest.raises(UsageError, match=re.escape(said)):
-        watch(rig, tmp_path / "images", tmp_path / "out", *options)
-    assert not (tmp_path / "out" / "calibration.h5").exists()
 
 
 def test_a_watch_without_a_time_between_frames_is_refused_at_once(tmp_path: Path) -> None:

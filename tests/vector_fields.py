@@ -1,11 +1,14 @@
-"""Vector fields made of a flow and of noise of stated size."""
+"""Vector fields made of a flow and of noise of stated size; and points of any format."""
+
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lfpiv_cli.arrays import Floats
+from lfpiv_cli.files.particle_file import OPTIONAL, UNITS, Points
 from lfpiv_cli.flow.field import VALID, VectorField
-from lfpiv_cli.grid import Grid
+from lfpiv_cli.grid import FOCAL_POINT, Grid
 
 SHAPE = (9, 10, 11)
 SPACING_MM = (0.8, 0.6, 1.1)
@@ -26,6 +29,20 @@ def field_on(
     ones, flag = np.ones(grid.shape_zyx), np.full(grid.shape_zyx, VALID, np.uint8) if flag is None else flag
     moved = displacement_voxel
     return VectorField(grid, moved, moved, ones, ones, ones, flag, sigma_voxel, voxel_mm, dt_s, (8, 8, 8))
+
+
+def points_of(
+    format_name: str, rng: np.random.Generator, count: int = 12, provenance: dict[str, Any] | None = None, **told: Any
+) -> Points:
+    """Return points with every array that their format has; three of each track or frame."""
+    wide = {"covariance_mm2": 6, "displacement_covariance_mm2": 6, "velocity": 3, "velocity_sigma": 3}
+    wide["displacement_mm"] = 3
+    whole = {"flag", "particle_a", "particle_b", "track", "frame", "particle"}
+    arrays = {
+        name: np.arange(count) // 3 if name in whole else rng.random((count, wide[name]) if name in wide else count)
+        for name in (*UNITS[format_name], *OPTIONAL.get(format_name, {}))
+    }
+    return Points(rng.random((count, 3)), arrays, FOCAL_POINT, told, provenance or {})
 
 
 def field_of(moved_mm: Floats, sigma_voxel: Floats | None) -> VectorField:
