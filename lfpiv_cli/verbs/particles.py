@@ -24,10 +24,9 @@ from lfpiv_cli.files.provenance import record
 from lfpiv_cli.files.weights_file import WeightsFile, open_weights
 from lfpiv_cli.notice import Notice, warn_of
 from lfpiv_cli.optics.curved_space import CurvedSpace
-from lfpiv_cli.optics.line_responses import USUAL_DIFFUSION_PX
 from lfpiv_cli.optics.tracing import ObjectSpace
 from lfpiv_cli.particles.counting import tracers_per_lens as counted
-from lfpiv_cli.particles.diameter import ENOUGH, UNKNOWN_LENSES, Diameter, diameter_by
+from lfpiv_cli.particles.diameter import ENOUGH, UNKNOWN_LENSES, diameter_by
 from lfpiv_cli.particles.microlens_focus import FocalLength, focal_length_of
 from lfpiv_cli.particles.neighbour_frames import second_frame, second_pass
 from lfpiv_cli.particles.rounds import ROUNDS, first_pass
@@ -39,7 +38,7 @@ from lfpiv_cli.reconstruction.images import Image, Mask, filled, light
 from lfpiv_cli.reconstruction.solvers import Normalisers
 from lfpiv_cli.verbs import frames as of_frames
 from lfpiv_cli.verbs.frames import IMAGE, STILL, Bench, Progress, Read, check_frame, read_frame, readable
-from lfpiv_cli.verbs.tracers import Diffusion, TracerSize, light_notices, size_notices
+from lfpiv_cli.verbs.tracers import TracerSize, light_notices, size_notices, tracer_size
 from lfpiv_cli.weights.build import factorise_bricks
 from lfpiv_cli.weights.columns import OnDemandOperator
 
@@ -202,32 +201,12 @@ def size_of(bench: Bench, frames: Iterable[Frame]) -> Sized:
     found = diameter_by(
         (task_for(bench, frame) for frame in islice(frames, LOOKED_AT)), given and given / lens_mm, given_px
     )
-    size = _size_of(found, given, given_px, lens_mm, by_waves=chosen.wavelength_nm is not None)
+    size = tracer_size(found, given, given_px, lens_mm, by_waves=chosen.wavelength_nm is not None)
     if found is not None:
-        single = (_size_of(each, given, given_px, lens_mm, size.diffusion is not None) for each in found.frames)
+        single = (tracer_size(each, given, given_px, lens_mm, size.diffusion is not None) for each in found.frames)
         size = replace(size, frames=tuple(single))
     held = None if found is None or size.diffusion is None else found.held
     return Sized(size, None if held is None else held.covariance, found is not None and found.tracers >= ENOUGH)
-
-
-def _size_of(
-    found: Diameter | None, given: float | None, given_px: float | None, lens_mm: float, by_waves: bool
-) -> TracerSize:
-    """Return the tracers' size, as given or by what images show of it, by waves with diffusion."""
-    diffusion = None
-    if by_waves:
-        # As given, by the images, or as is usual.
-        shown = None if found is None else found.held if given_px is None else found.shown
-        usual = USUAL_DIFFUSION_PX if shown is None else shown.diffusion_px
-        diffusion = Diffusion(usual if given_px is None else given_px, given=given_px is not None)
-        if shown is not None:
-            diffusion = replace(
-                diffusion, measured_px=shown.diffusion_px, sigma_px=shown.sigma_px, reported=shown.reported
-            )
-    if found is None:
-        return TracerSize(given or UNKNOWN_LENSES * lens_mm, diffusion=diffusion)
-    measured = lens_mm * found.lenses
-    return TracerSize(given or measured, measured, lens_mm * found.sigma_lenses, found.resolved, diffusion)
 
 
 def find(bench: Bench, frame: Frame, progress: Progress | None = None) -> Particles:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
@@ -10,7 +10,8 @@ import numpy as np
 from lfpiv_cli.files.config import Config
 from lfpiv_cli.files.particle_file import Points
 from lfpiv_cli.notice import Notice, written
-from lfpiv_cli.particles.diameter import LIMIT_SIGMAS
+from lfpiv_cli.optics.line_responses import USUAL_DIFFUSION_PX
+from lfpiv_cli.particles.diameter import LIMIT_SIGMAS, UNKNOWN_LENSES, Diameter
 from lfpiv_cli.particles.diffusion import USUAL_SIGMA_PX
 from lfpiv_cli.particles.search import MUCH_ALIKE, MUCH_LEFT
 from lfpiv_cli.verbs.frames import haze_notices
@@ -108,6 +109,26 @@ class TracerSize:
             "particle_diameter_measured_mm": self.measured_mm,
             "particle_diameter_sigma_mm": self.sigma_mm,
         } | (self.diffusion.summary() if self.diffusion else {})
+
+
+def tracer_size(
+    found: Diameter | None, given: float | None, given_px: float | None, lens_mm: float, by_waves: bool
+) -> TracerSize:
+    """Return the tracers' size, as given or by what images show of it, by waves with diffusion."""
+    diffusion = None
+    if by_waves:
+        # As given, by the images, or as is usual.
+        shown = None if found is None else found.held if given_px is None else found.shown
+        usual = USUAL_DIFFUSION_PX if shown is None else shown.diffusion_px
+        diffusion = Diffusion(usual if given_px is None else given_px, given=given_px is not None)
+        if shown is not None:
+            diffusion = replace(
+                diffusion, measured_px=shown.diffusion_px, sigma_px=shown.sigma_px, reported=shown.reported
+            )
+    if found is None:
+        return TracerSize(given or UNKNOWN_LENSES * lens_mm, diffusion=diffusion)
+    measured = lens_mm * found.lenses
+    return TracerSize(given or measured, measured, lens_mm * found.sigma_lenses, found.resolved, diffusion)
 
 
 def size_notices(settings: Config, size: TracerSize) -> list[Notice]:
