@@ -9,17 +9,16 @@ from typing import Any
 
 import numpy as np
 
-from lfpiv_cli.calibration.model import Calibration
 from lfpiv_cli.console import CONSOLE, Console
 from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.files import atomic, batch, calibration_file, pages, provenance
 from lfpiv_cli.files import images as image_files
-from lfpiv_cli.files.config import Config, load_rig
+from lfpiv_cli.files.config import load_rig
 from lfpiv_cli.files.inputs import given
 from lfpiv_cli.notice import Notice
 from lfpiv_cli.optics.curved_space import CurvedSpace
 from lfpiv_cli.optics.tracing import ObjectSpace
-from lfpiv_cli.reconstruction.images import Image, light
+from lfpiv_cli.reconstruction.images import light
 from lfpiv_cli.self_calibration.refinement import STEPS, ChannelFlow, Refinement
 from lfpiv_cli.self_calibration.refinement import refine_calibration as refine
 from lfpiv_cli.self_calibration.scene_refinement import AGREEING_CHI2, STEPS_OF_FIRST, SceneRefinement, refine_scene
@@ -65,19 +64,26 @@ def refine_calibration(
     before = calibration_file.open_calibration(calibration)
     reported = load_rig(config)
     settings = reported.with_scene_of(before)
-    scene = settings.scene_space()
-    if settings.channel is None and scene is None:
+    # What the walls are known by.
+    known = settings.scene_space() or settings.channel
+    if known is None:
         raise ConfigError(f"{config}: channel: is missing; the walls are known by the channel's width, or by a scene")
-    frames, shape = batch.frames_of(images), settings.image_shape()
+    frames, shape, camera = batch.frames_of(images), settings.image_shape(), settings.camera_model()
     dark_image, empty = (image_files.read_reference(path, shape) if path else None for path in (dark, background))
     lit = [light(image_files.read_image(frame.path, frame.page, shape), dark_image, empty) for frame in frames]
+    grid, diameter_mm = settings.grid(), settings.reconstruction.particle_diameter_mm
     found: Refinement | SceneRefinement
-    if scene is None:
-        found = _walls(settings, lit, before, console)
-        mended = found.applied(before)
-    else:
-        found = _scene(settings, scene, lit, before, console)
+    if isinstance(known, CurvedSpace):
+        with console.progress(STEPS_OF_FIRST + (len(lit) - 1) * STEPS, "refine") as advance:
+            found = refine_scene(lit, before, camera, known, grid, diameter_mm, advance)
+        console.warn(scene_notices(found))
         mended = found.applied(before, reported.scene_fingerprint())
+    else:
+        space = ObjectSpace(settings.media_model(), settings.window_model(before.mid_plane_z_mm or 0.0), "exact")
+        flow = ChannelFlow(grid, known.width_mm, diameter_mm, settings.reconstruction.wave_light())
+        with console.progress(len(lit) * STEPS + 1, "refine") as advance:
+            found = refine(lit, before, camera, space, flow, advance)
+        mended = found.applied(before)
     if output:
         made_by = provenance.record("refine-calibration", reported.resolved(), inputs)
         calibration_file.write_calibration(output, mended, made_by, overwrite)
@@ -87,37 +93,6 @@ def refine_calibration(
         drawn = walls_figure(found) if isinstance(found, Refinement) else round_wall_figure(found)
         pages.write_picture(picture, drawn, overwrite)
     return found.summary()
-
-
-def _walls(settings: Config, lit: Sequence[Image], before: Calibration, console: Console) -> Refinement:
-    """Return what tracers tell of a channel."""
-    if settings.channel is None:
-        raise ConfigError(f"{settings.source}: channel: is missing")
-    window = settings.window_model(before.mid_plane_z_mm or 0.0)
-    chosen = settings.reconstruction
-    flow = ChannelFlow(settings.grid(), settings.channel.width_mm, chosen.particle_diameter_mm, chosen.wave_light())
-    with console.progress(len(lit) * STEPS + 1, "refine") as advance:
-        return refine(
-            lit, before, settings.camera_model(), ObjectSpace(settings.media_model(), window, "exact"), flow, advance
-        )
-
-
-def _scene(
-    settings: Config, scene: CurvedSpace, lit: Sequence[Image], before: Calibration, console: Console
-) -> SceneRefinement:
-    """Return what tracers tell of the place of a scene, from where config and calibration have it."""
-    with console.progress(STEPS_OF_FIRST + (len(lit) - 1) * STEPS, "refine") as advance:
-        found = refine_scene(
-            lit,
-            before,
-            settings.camera_model(),
-            scene,
-            settings.grid(),
-            settings.reconstruction.particle_diameter_mm,
-            advance,
-        )
-    console.warn(scene_notices(found))
-    return found
 
 
 def scene_notices(found: SceneRefinement) -> list[Notice]:
