@@ -164,11 +164,11 @@ class Config:
         ConfigError : there is none, or a `scene` in its place
         """
         self.ensure_plane_layers("this command")
-        if self.channel is not None and mid_plane_z_mm is not None:
-            wall = self.channel.width_mm, self.channel.wall_mm
-            return channel_window(self.camera_model().focus_distance_mm, self.media_model(), *wall, mid_plane_z_mm)
-        section = self._needed("window", self.sections.window)
-        return Window(section.distance_mm, section.thickness_mm)
+        if self.channel is None or mid_plane_z_mm is None:
+            section = self._needed("window", self.sections.window)
+            return Window(section.distance_mm, section.thickness_mm)
+        wall = self.channel.width_mm, self.channel.wall_mm
+        return channel_window(self.camera_model().focus_distance_mm, self.media_model(), *wall, mid_plane_z_mm)
 
     def object_space(self, mid_plane_z_mm: float | None = None) -> ObjectSpace | CurvedSpace:
         """Return what rays cross on their way to the lens: the faces of `scene`, else what `plane_space` gives.

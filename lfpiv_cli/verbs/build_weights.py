@@ -75,8 +75,9 @@ def build_weights(rig: Config, calibration: Calibration | None = None, **setting
         The rig or the settings are not possible, or need a calibration that is not there.
     """
     chosen = rig.overridden("weights", **settings).with_scene_of(calibration)
+    made = record("build-weights", chosen.resolved(), {})
     plan = plan_of(chosen, calibration)
-    found = weights_of(plan, record("build-weights", chosen.resolved(), {}), Console(quiet=True))
+    found = weights_of(plan, made, Console(quiet=True))
     warn_of(plan.notices)
     return found.behind_vignetting()
 
@@ -113,10 +114,6 @@ def plan_of(settings: Config, found: Calibration | None) -> Plan:
     ConfigError, InputError
         Rig and settings are not possible, or need another calibration.
     """
-    weights_cost.check_rig(settings, found)
-    camera = settings.camera_model()
-    if found:
-        camera = found.camera(camera)
     # Fitted rays count z from the origin that the boards' depths were told from.
     reference = Reference(settings.volume.reference, 0.0)
     if reference.name != "focal_point" and settings.weights.method != "dlfc":
@@ -126,20 +123,19 @@ def plan_of(settings: Config, found: Calibration | None) -> Plan:
                 "channel: they say where the mid plane lies"
             )
         reference = Reference(reference.name, found.mid_plane_z_mm)
-    grid = settings.grid(reference)
-    source, padding = ray_source(settings, found), settings.reconstruction.padding_voxel
+    source, grid, sheet = ray_source(settings, found), settings.grid(reference), settings.camera_model()
+    beyond = _reach_notices(settings, found, grid)
+    notices = weights_cost.check_rig(settings, found)
+    camera, padding = found.camera(sheet) if found else sheet, settings.reconstruction.padding_voxel
     if not padding and isinstance(source, CurvedSpace):
         padding = curved_padding(camera, source, grid)
     padding = padding or default_padding(camera, settings.media_model(), grid)
     weights_cost.check_rays(settings, source, grid.padded(padding))
+    notices += weights_cost.ray_notices(settings, found, camera, source, grid)
     # What may lie out of view without a word.
     x, y, z = (-math.ceil(RIM_SHARE * n) if n > 2 else 0 for n in grid.shape_xyz)
-    notices = [
-        *weights_cost.rig_notices(settings, found, camera, source, grid),
-        *_view_notices(*seen_share(camera, source, grid.padded((x, y, z))), grid),
-        *_reach_notices(settings, found, grid),
-    ]
-    return Plan(settings, found, camera, reference, grid, padding, source, notices)
+    notices += _view_notices(*seen_share(camera, source, grid.padded((x, y, z))), grid)
+    return Plan(settings, found, camera, reference, grid, padding, source, notices + beyond)
 
 
 def weights_of(plan: Plan, provenance: dict[str, Any], console: Console) -> WeightsFile:

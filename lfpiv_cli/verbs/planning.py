@@ -31,7 +31,7 @@ from lfpiv_cli.verbs.build_weights import ray_source
 from lfpiv_cli.verbs.checks import Line, Verdict
 from lfpiv_cli.verbs.particles import light_of
 from lfpiv_cli.verbs.simulate import readout_of
-from lfpiv_cli.verbs.weights_cost import TRACER_S, Cost, check_rig, cost_notices, cost_of, rig_notices
+from lfpiv_cli.verbs.weights_cost import TRACER_S, Cost, check_rig, cost_notices, cost_of, ray_notices
 from lfpiv_cli.weights.build import default_padding
 from lfpiv_cli.weights.scene import Source
 
@@ -276,13 +276,12 @@ def _rays(bench: Bench) -> Line:
     try:
         check_rig(bench.settings, bench.found)
         source = _source(bench)
-        notices = rig_notices(bench.settings, bench.found, bench.camera, source, bench.grid)
+        notices = ray_notices(bench.settings, bench.found, bench.camera, source, bench.grid)
     except (ConfigError, InputError) as error:
         return Line("rays", "no", str(error))
-    reported = [notice for notice in notices if notice.code != "f-numbers"]
-    if not reported:
+    if not notices:
         return Line("rays", "good", "paraxial lens and refraction are right to half a pixel")
-    return Line("rays", "look", "; ".join(f"{notice.about} {notice.text}: {notice.remedy}" for notice in reported))
+    return Line("rays", "look", "; ".join(f"{notice.about} {notice.text}: {notice.remedy}" for notice in notices))
 
 
 def diffraction_line(bench: Bench) -> Line:

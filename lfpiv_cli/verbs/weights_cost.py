@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
 
-from lfpiv_cli.arrays import Floats
 from lfpiv_cli.calibration.model import Calibration
 from lfpiv_cli.calibration.sheet import check_f_numbers, check_pitch, f_number_notices
 from lfpiv_cli.errors import ConfigError
@@ -21,7 +20,6 @@ from lfpiv_cli.notice import Notice, written
 from lfpiv_cli.optics import tracing
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.curved_space import CurvedSpace
-from lfpiv_cli.optics.media import Media
 from lfpiv_cli.weights.build import separates
 from lfpiv_cli.weights.columns import LARGEST_BYTES
 from lfpiv_cli.weights.kernels import SLAB, STRIP
@@ -37,8 +35,8 @@ LARGEST_TANGENT = 1.0
 DEPTHS = 9
 
 
-def check_rig(settings: Config, found: Calibration | None) -> None:
-    """Refuse a camera that cannot be as the data sheet has it, by itself or beside a calibration.
+def check_rig(settings: Config, found: Calibration | None) -> list[Notice]:
+    """Refuse a camera that cannot be as the data sheet has it, or beside a calibration; return what speaks against it.
 
     Raises
     ------
@@ -55,53 +53,42 @@ def check_rig(settings: Config, found: Calibration | None) -> None:
             "may be with traced rays; boards at several depths and weights.method: dlfc fit the rays of such an "
             "objective"
         )
+    return f_number_notices(sheet)
 
 
-def rig_notices(
+def ray_notices(
     settings: Config, found: Calibration | None, camera: Camera, source: Source, grid: Grid
 ) -> list[Notice]:
-    """Return what speaks against the weights of a grid, z from the focal point, behind a camera."""
-    notices = f_number_notices(settings.camera_model())
-    depths = np.linspace(*grid.bounds_mm(2), DEPTHS)
+    """Return how far traced rays are off: through the volume, z from the focal point, and a thin lens."""
+    window = None
+    with suppress(ConfigError):
+        window = settings.window_model(found.mid_plane_z_mm if found else None)
+    if isinstance(source, tracing.PolynomialRays):
+        return []
+    notices, limit = list[Notice](), f"at most {tracing.LARGEST_ERROR_PX:g} px"
     if isinstance(source, CurvedSpace):
-        return [*notices, *_of_sines(camera, source.media, seen_depths_mm(camera, source, grid))]
-    if not isinstance(source, tracing.ObjectSpace):
-        return notices
-    if source.refraction != "exact" and source.media != source.media.in_air():
-        try:
-            window = settings.window_model(found.mid_plane_z_mm if found else None)
-        except ConfigError:
-            window = None
-        error_px = tracing.refraction_error_mm(camera, source.media, window, depths) / camera.pixel_mm
-        if error_px > tracing.LARGEST_ERROR_PX:
+        depths = seen_depths_mm(camera, source, grid)
+    else:
+        depths = np.linspace(*grid.bounds_mm(2), DEPTHS)
+        bent_px = 0.0
+        if source.refraction != "exact" and source.media != source.media.in_air():
+            bent_px = tracing.refraction_error_mm(camera, source.media, window, depths) / camera.pixel_mm
+        if bent_px > tracing.LARGEST_ERROR_PX:
             text = (
                 "is paraxial, and Snell's law moves light at the rim of the aperture by "
-                f"{'' if window else 'at least '}{written(error_px, 2)} px on the array, at most "
-                f"{tracing.LARGEST_ERROR_PX:g} px without harm"
+                f"{'' if window else 'at least '}{written(bent_px, 2)} px on the array, {limit} without harm"
             )
             remedy = "--refraction exact" if window else "give the section window, or channel, and --refraction exact"
-            limit = f"at most {tracing.LARGEST_ERROR_PX:g} px"
-            notices.append(Notice("paraxial-refraction", "weights.refraction", text, remedy, error_px, limit))
-    return [*notices, *_of_sines(camera, source.media, depths)]
-
-
-def _of_sines(camera: Camera, media: Media, depths: Floats) -> Iterator[Notice]:
-    error_px = tracing.sine_error_mm(camera, media, depths) / camera.pixel_mm
-    if error_px <= tracing.LARGEST_ERROR_PX:
-        return
-    text = (
-        f"NA {_na(camera):.2f}: the rays of a thin lens are off by {written(error_px, 2)} px on the array at the "
-        f"volume's faces, at most {tracing.LARGEST_ERROR_PX:g} px without harm; depths will be wrong"
-    )
-    remedy = "a smaller aperture or a thinner volume, or boards at several depths and weights.method: dlfc"
-    yield Notice(
-        "paraxial-lens",
-        "camera.main_lens.aperture_mm",
-        text,
-        remedy,
-        error_px,
-        f"at most {tracing.LARGEST_ERROR_PX:g} px",
-    )
+            notices.append(Notice("paraxial-refraction", "weights.refraction", text, remedy, bent_px, limit))
+    error_px = tracing.sine_error_mm(camera, source.media, depths) / camera.pixel_mm
+    if error_px > tracing.LARGEST_ERROR_PX:
+        text = (
+            f"NA {_na(camera):.2f}: the rays of a thin lens are off by {written(error_px, 2)} px on the array at the "
+            f"volume's faces, {limit} without harm; depths will be wrong"
+        )
+        remedy = "a smaller aperture or a thinner volume, or boards at several depths and weights.method: dlfc"
+        notices.append(Notice("paraxial-lens", "camera.main_lens.aperture_mm", text, remedy, error_px, limit))
+    return notices
 
 
 def _na(camera: Camera) -> float:
