@@ -291,12 +291,6 @@ def read_extra(path: Path) -> tuple[dict[str, NDArray[Any]], dict[str, dict[str,
     return arrays, tables
 
 
-def read_grid(path: Path) -> Grid:
-    """Read the grid of a volume or a vector field."""
-    with open_h5(path) as file:
-        return grid_in(file)
-
-
 def read_header(path: Path | str) -> Header:
     """Read what a volume, a vector field or points say about themselves."""
     with open_h5(Path(path)) as file:

@@ -76,7 +76,20 @@ def correlate(
     UsageError
         Plain arrays are given without `voxel_mm`.
     """
-    first, second = (_as_volume(each, voxel_mm) for each in (a, b))
+    volumes = []
+    for each in (a, b):
+        if isinstance(each, Volume):
+            volumes.append(each)
+            continue
+        # A plain array lies about the origin.
+        if voxel_mm is None:
+            raise UsageError("correlate: plain arrays need voxel_mm, the size of a voxel along x, y, z")
+        array = np.asarray(each, dtype=np.float32)
+        if array.ndim != 3:
+            raise InputError(f"a volume of shape {array.shape}, expected (nz, ny, nx)")
+        grid = Grid.centred((array.shape[2], array.shape[1], array.shape[0]), voxel_mm, (0.0, 0.0, 0.0))
+        volumes.append(Volume(array, grid, FOCAL_POINT, {}, {}))
+    first, second = volumes
     ensure_alike(first, second, ("the first volume", "the second volume"))
     config = first.provenance.get("config")
     carried = carried_config(first.provenance, "the volume") if config else Config.from_resolved({})
@@ -111,19 +124,6 @@ def ensure_alike(first: Volume, second: Volume, names: tuple[str, str]) -> None:
     if first.reference.name != second.reference.name:
         raise InputError(f"{names[1]}: its coordinates have another origin than those of {names[0]}")
     provenance.ensure_agreement([first.provenance, second.provenance], names, provenance.OF_FRAMES)
-
-
-def _as_volume(volume: Volume | NDArray[Any], voxel_mm: tuple[float, float, float] | None) -> Volume:
-    """Return a volume as such, a plain array about the origin."""
-    if isinstance(volume, Volume):
-        return volume
-    if voxel_mm is None:
-        raise UsageError("correlate: plain arrays need voxel_mm, the size of a voxel along x, y, z")
-    array = np.asarray(volume, dtype=np.float32)
-    if array.ndim != 3:
-        raise InputError(f"a volume of shape {array.shape}, expected (nz, ny, nx)")
-    nz, ny, nx = array.shape
-    return Volume(array, Grid.centred((nx, ny, nz), voxel_mm, (0.0, 0.0, 0.0)), FOCAL_POINT, {}, {})
 
 
 # Numbers of eight bytes that a file has of each vector at most, and derived ones besides.
@@ -274,7 +274,8 @@ class Correlation(PairBatch[Outcome, CorrelateOptions]):
 
     def expected(self) -> Expected:
         """Return the bytes of a field's arrays, and what a correlation holds."""
-        grid, settings = vtkhdf.read_grid(self._first), self.settings
+        with hdf5.open_h5(self._first) as file:
+            grid, settings = vtkhdf.grid_in(file), self.settings
         held = held_bytes(grid.shape_xyz, settings.correlation_settings(grid.spacing_mm))
         return Expected(field_bytes(settings, grid, self._options.derived), len(self._groups[0]) * held)
 
