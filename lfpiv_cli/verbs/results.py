@@ -50,14 +50,14 @@ class Kind:
     ----------
     write : into a file, and whether one that is there is replaced
     figures : the function of `verbs.plot` that gives the figures of its file, and what this is given
-    describe : in words
     content : its arrays, None where it is not one of arrays
+    describe : in words; of arrays, None: their extent and medians
     """
 
     write: Callable[[Any, Path, bool], None]
     figures: Callable[[Any], tuple[str, tuple[Any, ...]]]
-    describe: Callable[[Any], str]
     content: Callable[[Any], Content] | None = None
+    describe: Callable[[Any], str] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,27 +133,6 @@ def _in_mm(grid: Grid, noun: str, reference: Reference) -> str:
     return f"{counts} {noun}, {sizes} mm each (x, y, z); {_reach([grid.bounds_mm(k) for k in range(3)], reference)}"
 
 
-def _described_arrays(content: Content) -> str:
-    """Return the extent and the medians of arrays."""
-    reference, noun = Reference.from_attributes(content.attributes), NOUNS[content.format_name]
-    if content.grid is not None:
-        extent = _in_mm(content.grid, noun, reference)
-    else:
-        places = content.arrays[POSITION]
-        extent = f"{len(places)} {noun}"
-        if len(places):
-            extent += f"; {_reach(np.stack([places.min(axis=0), places.max(axis=0)], axis=1), reference)}"
-    medians = []
-    for name in [name for name in MEDIANS_OF if name in content.arrays][:MOST_MEDIANS]:
-        array, unit = content.arrays[name], content.units[name]
-        columns = array.reshape(-1, array.shape[-1]) if content.components(name) else array.reshape(-1, 1)
-        known = columns[np.isfinite(columns).all(axis=1)]
-        if len(known):
-            middle = ", ".join(map(written, np.median(known, axis=0)))
-            medians.append(f"{name} {middle}{'' if unit == '1' else f' {unit}'}")
-    return extent + (f"\n  medians: {'; '.join(medians)}" if medians else "")
-
-
 def _described_calibration(found: Calibration) -> str:
     figures = found.summary()
     rows, columns = found.image_shape
@@ -191,22 +170,16 @@ def _write_points(result: Points | Tracked, path: Path, overwrite: bool) -> None
     particle_file.write_points(path, points.format_name, points, overwrite=overwrite)
 
 
-def _of_arrays(
-    write: Callable[[Any, Path, bool], None],
-    figures: Callable[[Any], tuple[str, tuple[Any, ...]]],
-    content: Callable[[Any], Content],
-) -> Kind:
-    return Kind(write, figures, lambda result: _described_arrays(content(result)), content)
-
-
 # By the names of classes, most of which are loaded by who uses them alone.
 KINDS = {
-    "Calibration": Kind(_write_calibration, lambda found: ("of_calibration", (found,)), _described_calibration),
-    "WeightsFile": Kind(_write_weights, lambda content: ("of_weights", (content,)), _described_weights),
-    "Volume": _of_arrays(_write_volume, lambda volume: ("of_volume", (volume,)), content_of),
+    "Calibration": Kind(
+        _write_calibration, lambda found: ("of_calibration", (found,)), describe=_described_calibration
+    ),
+    "WeightsFile": Kind(_write_weights, lambda content: ("of_weights", (content,)), describe=_described_weights),
+    "Volume": Kind(_write_volume, lambda volume: ("of_volume", (volume,)), content_of),
     **dict.fromkeys(
         ("VectorField", "FittedField", "Combined", "FlowStatistics"),
-        _of_arrays(
+        Kind(
             lambda result, path, overwrite: Vectors.of(result).write(path, overwrite),
             lambda result: ("of_vectors", Vectors.of(result).figures()),
             lambda result: Vectors.of(result).content(),
@@ -214,7 +187,7 @@ KINDS = {
     ),
     **dict.fromkeys(
         ("Points", "Tracked"),
-        _of_arrays(
+        Kind(
             _write_points,
             lambda result: (OF_POINTS[_points_of(result).format_name], (_points_of(result),)),
             lambda result: content_of(_points_of(result)),
@@ -229,7 +202,27 @@ def _kind_of(result: Result) -> Kind:
 
 def described(result: Result) -> str:
     """Return what a result is in two lines."""
-    return f"{type(result).__name__}: {_kind_of(result).describe(result)}"
+    name, describe = type(result).__name__, _kind_of(result).describe
+    if describe is not None:
+        return f"{name}: {describe(result)}"
+    content = _content_of(result)
+    reference, noun = Reference.from_attributes(content.attributes), NOUNS[content.format_name]
+    if content.grid is not None:
+        extent = _in_mm(content.grid, noun, reference)
+    else:
+        places = content.arrays[POSITION]
+        extent = f"{len(places)} {noun}"
+        if len(places):
+            extent += f"; {_reach(np.stack([places.min(axis=0), places.max(axis=0)], axis=1), reference)}"
+    medians = []
+    for named in [each for each in MEDIANS_OF if each in content.arrays][:MOST_MEDIANS]:
+        array, unit = content.arrays[named], content.units[named]
+        columns = array.reshape(-1, array.shape[-1]) if content.components(named) else array.reshape(-1, 1)
+        known = columns[np.isfinite(columns).all(axis=1)]
+        if len(known):
+            middle = ", ".join(map(written, np.median(known, axis=0)))
+            medians.append(f"{named} {middle}{'' if unit == '1' else f' {unit}'}")
+    return f"{name}: {extent}" + (f"\n  medians: {'; '.join(medians)}" if medians else "")
 
 
 def save(result: Result, path: Path | str, overwrite: bool) -> None:
