@@ -233,115 +233,15 @@ def contradiction(first: Seen, second: Seen) -> str | None:
 
 
 def _places(frames: Sequence[Seen], how: Pairing, by: str | None) -> list[Place | None]:
-    """Return where each frame belongs."""
+    """Return where each frame belongs: by a template, or what its name says beside the others.
+
+    None where that has neither a number nor a frame's letter.
+    """
     if by is not None:
         return places_by(by, [frame.path for frame in frames])
-    places = places_of([frame.stem for frame in frames], how)
-    return [
-        place if frame.page is None else Place(f"pages of {frame.stem}", frame.page, begins=0)
-        for frame, place in zip(frames, places, strict=True)
-    ]
-
-
-def _pair(places: Mapping[int, Place], found: _Found, coming: bool) -> None:
-    """Find separate pairs."""
-    numbered = _by_series({number: place for number, place in places.items() if place.frame is None})
-    slots: dict[tuple[str, int], dict[int, list[int]]] = defaultdict(lambda: {0: [], 1: []})
-    for number, place in places.items():
-        if place.frame is not None:
-            slots[place.series, place.number][place.frame].append(number)
-    open_ones = [series for series, members in numbered.items() if places[members[0]].begins is None]
-    for series, members in numbered.items():
-        begins: int | str | None = places[members[0]].begins
-        if begins is None and len(open_ones) > 1:
-            begins = (
-                f"running numbers are of {len(open_ones)} series ({', '.join(open_ones[:3])}), so it is open what is "
-                "first and second of a pair"
-            )
-        elif begins is None:
-            begins = _beginning([places[k].number for k in (members[:2] if coming else members)])
-        if isinstance(begins, str):
-            found.leave_out(members, begins)
-            continue
-        for k in members:
-            pair, half = divmod(places[k].number - begins, 2)
-            slots[series, pair][half].append(k)
-    for _, slot in sorted(slots.items()):
-        if len(slot[0]) == len(slot[1]) == 1:
-            found.pairs.append((slot[0][0], slot[1][0]))
-        elif len(slot[0]) > 1 or len(slot[1]) > 1:
-            names = " and ".join(found.names[k] for k in (slot[0] if len(slot[0]) > 1 else slot[1]))
-            found.leave_out((*slot[0], *slot[1]), f"of its pair one frame is there twice: {names}")
-        else:
-            missing = "second" if slot[0] else "first"
-            found.leave_out((*slot[0], *slot[1]), f"the {missing} frame of its pair is missing")
-
-
-def _by_series(places: Mapping[int, Place]) -> dict[str, list[int]]:
-    """Return the frames of each series in the order of their numbers."""
-    found: dict[str, list[int]] = defaultdict(list)
-    for number in sorted(places, key=lambda k: (places[k].series, _position(places[k]))):
-        found[places[number].series].append(number)
-    return found
-
-
-def _position(place: Place) -> int:
-    """Return where a frame is in its series."""
-    return place.number if place.frame is None else 2 * place.number + place.frame
-
-
-def _beginning(numbers: Sequence[int]) -> int | str:
-    """Return where running numbers begin that are those of whole pairs, or why a lost frame leaves it open.
-
-    Frames count from 0 or from 1. With 0 there, it is known; without it, 0 may be what is missing, and where any number
-    is missing all others might stand in the wrong halves of pairs. Where neither is there, the first may be a second.
-    """
-    if numbers[0] == 0:
-        return 0
-    if len(numbers) % 2 == 0 and list(numbers) == list(range(1, 1 + len(numbers))):
-        return 1
-    missing = next((before + 1 for before, after in pairwise(numbers) if after > before + 1), None)
-    lost = "not all make pairs" if missing is None else f"{missing} is missing"
-    if missing is None and numbers[0] > 1:
-        lost = "none is 0 or 1"
-    return (
-        f"of the running numbers {numbers[0]} to {numbers[-1]} {lost}, so it is open whether even or odd ones begin "
-        f"pairs (--pair-by with {{number}} for even, {{number:1}} for odd)"
-    )
-
-
-def _follow(places: Mapping[int, Place], found: _Found) -> None:
-    """Find pairs of each frame with the next, none across a gap."""
-    for members in _by_series(places).values():
-        at: dict[int, list[int]] = defaultdict(list)
-        for number in members:
-            at[_position(places[number])].append(number)
-        for twice in (numbers for numbers in at.values() if len(numbers) > 1):
-            names = " and ".join(found.names[k] for k in twice)
-            found.leave_out(twice, f"the same frame is there twice: {names}")
-        once = [(position, numbers[0]) for position, numbers in at.items() if len(numbers) == 1]
-        if len(once) == 1:
-            found.leave_out([once[0][1]], "no frame comes before or after it")
-        step = min((after[0] - before[0] for before, after in pairwise(once)), default=1)
-        for (position, number), (following, after) in pairwise(once):
-            if following - position <= MOST_STEPS * step:
-                found.pairs.append((number, after))
-            else:
-                found.leave_out([after], f"frames are missing between {found.names[number]} and it")
-        if step > 1:
-            text = f"numbers go up by {step}; each frame is taken with the next that is there"
-            remedy = "where frames are missing between them, set dt_s to the time between those that are there"
-            found.notices.append(Notice("numbers-apart", found.names[once[0][1]], text, remedy, float(step), "1"))
-
-
-# What names say: of which series each is, its number, and whether it is the first or second of a pair.
-
-
-def places_of(stems: Sequence[str], how: Pairing) -> list[Place | None]:
-    """Return what each name says, read beside the others; None where it has neither a number nor a frame's letter."""
-    found: list[Place | None] = [None] * len(stems)
+    found: list[Place | None] = [None] * len(frames)
     alike: dict[tuple[str, ...], list[int]] = defaultdict(list)
-    read = [_tokens(stem) for stem in stems]
+    read = [_tokens(frame.stem) for frame in frames]
     for number, (tokens, _) in enumerate(read):
         # What tokens in the same place of names of one form have in common.
         kinds = (f"{token[:-1]}?" if token in MARKS else "#" if _is_number(token) else token for token in tokens)
@@ -369,7 +269,97 @@ def places_of(stems: Sequence[str], how: Pairing) -> list[Place | None]:
                 found[member] = Place(series, running or 0, marks[k])
             elif (position := read[member][1] if running is None else running) is not None:
                 found[member] = Place(series, position)
+    return [
+        place if frame.page is None else Place(f"pages of {frame.stem}", frame.page, begins=0)
+        for frame, place in zip(frames, found, strict=True)
+    ]
+
+
+def _pair(places: Mapping[int, Place], found: _Found, coming: bool) -> None:
+    """Find separate pairs."""
+    numbered = _by_series({number: place for number, place in places.items() if place.frame is None})
+    slots: dict[tuple[str, int], dict[int, list[int]]] = defaultdict(lambda: {0: [], 1: []})
+    for number, place in places.items():
+        if place.frame is not None:
+            slots[place.series, place.number][place.frame].append(number)
+    open_ones = [series for series, members in numbered.items() if places[members[0]].begins is None]
+    for series, members in numbered.items():
+        begins: int | str | None = places[members[0]].begins
+        if begins is None and len(open_ones) > 1:
+            begins = (
+                f"running numbers are of {len(open_ones)} series ({', '.join(open_ones[:3])}), so it is open what is "
+                "first and second of a pair"
+            )
+        elif begins is None:
+            # Frames count from 0 or from 1. With 0 there, it is known; without it, 0 may be what is missing, and where
+            # any number is missing all others might stand in the wrong halves of pairs. Where neither is there, the
+            # first may be a second.
+            numbers = [places[k].number for k in (members[:2] if coming else members)]
+            if numbers[0] == 0 or (len(numbers) % 2 == 0 and numbers == list(range(1, 1 + len(numbers)))):
+                begins = numbers[0]
+            else:
+                missing = next((before + 1 for before, after in pairwise(numbers) if after > before + 1), None)
+                lost = "none is 0 or 1" if numbers[0] > 1 else "not all make pairs"
+                begins = (
+                    f"of the running numbers {numbers[0]} to {numbers[-1]} "
+                    f"{lost if missing is None else f'{missing} is missing'}, so it is open whether even or odd ones "
+                    "begin pairs (--pair-by with {number} for even, {number:1} for odd)"
+                )
+        if isinstance(begins, str):
+            found.leave_out(members, begins)
+            continue
+        for k in members:
+            pair, half = divmod(places[k].number - begins, 2)
+            slots[series, pair][half].append(k)
+    for _, slot in sorted(slots.items()):
+        if len(slot[0]) == len(slot[1]) == 1:
+            found.pairs.append((slot[0][0], slot[1][0]))
+        elif len(slot[0]) > 1 or len(slot[1]) > 1:
+            names = " and ".join(found.names[k] for k in (slot[0] if len(slot[0]) > 1 else slot[1]))
+            found.leave_out((*slot[0], *slot[1]), f"of its pair one frame is there twice: {names}")
+        else:
+            half_missing = "second" if slot[0] else "first"
+            found.leave_out((*slot[0], *slot[1]), f"the {half_missing} frame of its pair is missing")
+
+
+def _by_series(places: Mapping[int, Place]) -> dict[str, list[int]]:
+    """Return the frames of each series in the order of their numbers."""
+    found: dict[str, list[int]] = defaultdict(list)
+    for number in sorted(places, key=lambda k: (places[k].series, _position(places[k]))):
+        found[places[number].series].append(number)
     return found
+
+
+def _position(place: Place) -> int:
+    """Return where a frame is in its series."""
+    return place.number if place.frame is None else 2 * place.number + place.frame
+
+
+def _follow(places: Mapping[int, Place], found: _Found) -> None:
+    """Find pairs of each frame with the next, none across a gap."""
+    for members in _by_series(places).values():
+        at: dict[int, list[int]] = defaultdict(list)
+        for number in members:
+            at[_position(places[number])].append(number)
+        for twice in (numbers for numbers in at.values() if len(numbers) > 1):
+            names = " and ".join(found.names[k] for k in twice)
+            found.leave_out(twice, f"the same frame is there twice: {names}")
+        once = [(position, numbers[0]) for position, numbers in at.items() if len(numbers) == 1]
+        if len(once) == 1:
+            found.leave_out([once[0][1]], "no frame comes before or after it")
+        step = min((after[0] - before[0] for before, after in pairwise(once)), default=1)
+        for (position, number), (following, after) in pairwise(once):
+            if following - position <= MOST_STEPS * step:
+                found.pairs.append((number, after))
+            else:
+                found.leave_out([after], f"frames are missing between {found.names[number]} and it")
+        if step > 1:
+            text = f"numbers go up by {step}; each frame is taken with the next that is there"
+            remedy = "where frames are missing between them, set dt_s to the time between those that are there"
+            found.notices.append(Notice("numbers-apart", found.names[once[0][1]], text, remedy, float(step), "1"))
+
+
+# What names say: of which series each is, its number, and whether it is the first or second of a pair.
 
 
 def places_by(template: str, names: Sequence[str]) -> list[Place | None]:

@@ -57,7 +57,16 @@ def _read_png(path: Path, page: int, shape: Shape | None) -> Image:
         if size > recordings.HARMLESS_BYTES + MOST_BYTES_A_PIXEL * math.prod(declared):
             raise InputError(f"has {size} bytes, more than a PNG of {declared[1]} x {declared[0]} pixels takes: {CUT}")
         content = path.read_bytes()
-        parts = list(_parts(content))
+        # Kind and body of each part: all are there, and undamaged.
+        parts, place, kind = list[tuple[bytes, bytes]](), len(PNG_START), b""
+        while kind != b"IEND":
+            kind, end = content[place + 4 : place + 8], place + 12 + int.from_bytes(content[place : place + 4], "big")
+            if end > len(content):
+                raise InputError(f"the part at byte {place} ends at byte {end} of {len(content)}: {CUT}")
+            if zlib.crc32(content[place + 4 : end - 4]) != int.from_bytes(content[end - 4 : end], "big"):
+                raise InputError(f"the part at byte {place} has a wrong check sum: {CUT}")
+            parts.append((kind, content[place + 8 : end - 4]))
+            place = end
         header = dict(parts).get(b"IHDR", b"")
         if len(header) != 13:
             raise InputError(f"its header has {len(header)} bytes, expected 13")
@@ -70,7 +79,7 @@ def _read_png(path: Path, page: int, shape: Shape | None) -> Image:
         # images have seven passes, the lines of each filled up.
         largest = rows * (columns * bits * PNG_SAMPLES[colour] // 8 + 2) + 7 * (2 * rows + columns)
         unpacker = zlib.decompressobj()
-        for packed in (body for kind, body in parts if kind == b"IDAT"):
+        for packed in (body for name, body in parts if name == b"IDAT"):
             largest -= len(unpacker.decompress(packed, largest + 1))
             if largest < 0 or unpacker.unconsumed_tail:
                 raise InputError(f"its data are more than the {columns} x {rows} pixels that it declares")
@@ -78,19 +87,6 @@ def _read_png(path: Path, page: int, shape: Shape | None) -> Image:
         if array.shape[:2] != (rows, columns):
             raise InputError(f"decodes to {array.shape}, it declares {rows, columns}")
         return as_counts(recordings.one_channel(array, "the image"))
-
-
-def _parts(content: bytes) -> Iterator[tuple[bytes, bytes]]:
-    """Yield kind and body of each part of a PNG, after checking that all are there and undamaged."""
-    place, kind = len(PNG_START), b""
-    while kind != b"IEND":
-        kind, end = content[place + 4 : place + 8], place + 12 + int.from_bytes(content[place : place + 4], "big")
-        if end > len(content):
-            raise InputError(f"the part at byte {place} ends at byte {end} of {len(content)}: {CUT}")
-        if zlib.crc32(content[place + 4 : end - 4]) != int.from_bytes(content[end - 4 : end], "big"):
-            raise InputError(f"the part at byte {place} has a wrong check sum: {CUT}")
-        yield kind, content[place + 8 : end - 4]
-        place = end
 
 
 # A walk over a TIFF file's directories that takes nothing on trust.

@@ -489,13 +489,11 @@ class Prepared:
         shape, dark = content.image_shape, options.dark_image(content.image_shape)
         pitch_px = float(content.camera.micro_image_lattice_px().pitch.max())
         # What is 0 is left out: as a file has it, or what does not move in the frames (`still`).
-        if options.mask is None:
-            mask = None
-        elif options.mask != STILL:
-            mask = image_files.read_reference(Path(options.mask), shape)
-        else:
+        mask = None
+        if options.mask == STILL:
             images = readable(lambda number: read_frame(frames[number], shape), range(len(frames)), keep_going)
-            still = of_images.still_light(images, pitch_px)
-            mask = np.where(still, np.float32(0.0), np.float32(1.0))
+            mask = np.where(of_images.still_light(images, pitch_px), np.float32(0.0), np.float32(1.0))
+        elif options.mask is not None:
+            mask = image_files.read_reference(Path(options.mask), shape)
         bench = self.bench(content, settings, dark, mask)
         return bench, of_frames.reader(options.level, frames, shape, dark, keep_going)
