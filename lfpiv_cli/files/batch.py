@@ -140,6 +140,18 @@ def output_paths(output: Path, stems: Sequence[str]) -> list[Path]:
     return [output / f"{stem}{VTKHDF_SUFFIX}" for stem in stems]
 
 
+Stamp = tuple[int, int] | None
+
+
+def stamp_of(path: Path) -> Stamp:
+    """Return what tells a file from another one under its name, None where there is none."""
+    try:
+        status = path.stat()
+    except OSError:
+        return None
+    return status.st_ino, status.st_mtime_ns
+
+
 def state_of(target: Target) -> State:
     """Return what is there in a target's place; what is called complete has been read back, all of it.
 

@@ -24,7 +24,7 @@ from typing import Any, Generic, Self, TypeVar
 from lfpiv_cli.console import Console, Frames
 from lfpiv_cli.errors import InputError, PartialError, UsageError
 from lfpiv_cli.files.atomic import ensure_apart, ensure_writable, write_text
-from lfpiv_cli.files.batch import State, Target, pending, state_of
+from lfpiv_cli.files.batch import Stamp, State, Target, pending, stamp_of, state_of
 from lfpiv_cli.files.inputs import PROGRAM_BYTES
 from lfpiv_cli.files.shares import SECONDS_BETWEEN_LOOKS, Deadline, Shard, claimed
 from lfpiv_cli.notice import Notice
@@ -34,8 +34,6 @@ MB = 1e6
 AT_MOST = "at most, uncompressed"
 # What a file has besides its arrays: its record and those of its inputs, attributes, and space that HDF5 leaves free.
 RECORD_BYTES = 100e3
-# What tells a file from another one under its name; None where there is none.
-Stamp = tuple[int, int] | None
 
 
 ALL = Shard(1, 1)
@@ -362,15 +360,6 @@ def _settle(
     else:
         worked.outcomes[number] = made
     work.done(name)
-
-
-def stamp_of(path: Path) -> Stamp:
-    """Return what tells a file from another one under its name, None where there is none."""
-    try:
-        status = path.stat()
-    except OSError:
-        return None
-    return status.st_ino, status.st_mtime_ns
 
 
 def dry_run(batch: Batch[Any], options: WorkOptions, console: Console) -> dict[str, Any]:

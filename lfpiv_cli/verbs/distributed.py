@@ -30,11 +30,12 @@ from distributed import Client, Future, KilledWorker, LocalCluster, Worker, Work
 import lfpiv_cli
 from lfpiv_cli.console import Console, Frames
 from lfpiv_cli.errors import InputError, LfpivError, StoppedEarlyError, UsageError
+from lfpiv_cli.files.batch import Stamp
 from lfpiv_cli.files.inputs import reason
 from lfpiv_cli.files.shares import SECONDS_BETWEEN_LOOKS, Deadline, Runs
 from lfpiv_cli.notice import Notice
 from lfpiv_cli.threads import told_threads, use_threads
-from lfpiv_cli.verbs.batches import Attempts, Batch, Made, Stamp, Turn, attempt
+from lfpiv_cli.verbs.batches import Attempts, Batch, Made, Turn, attempt
 
 # Workers on this machine, as many as it has cores, or `local:4`.
 LOCAL = re.compile(r"local(?::(\d{1,4}))?", re.ASCII)

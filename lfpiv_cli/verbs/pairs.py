@@ -16,13 +16,13 @@ from lfpiv_cli.console import Console, Frames
 from lfpiv_cli.errors import InputError, UsageError
 from lfpiv_cli.files import images as image_files
 from lfpiv_cli.files import listing, shares, vtkhdf
-from lfpiv_cli.files.batch import State, Target, pending, results_seen, state_or_none
+from lfpiv_cli.files.batch import Stamp, State, Target, pending, results_seen, stamp_of, state_or_none
 from lfpiv_cli.files.pairing import Pairs, Seen, contradiction, in_order, pair_frames, pairs_listed
 from lfpiv_cli.files.provenance import Gone, carried_record, sha256, without_warnings
 from lfpiv_cli.names import InputKind, Pairing
 from lfpiv_cli.notice import Notice
 from lfpiv_cli.verbs import batches
-from lfpiv_cli.verbs.batches import ALL, Batch, BatchOptions, Expected, Failure, Made, Stamp, Worked, WorkOptions
+from lfpiv_cli.verbs.batches import ALL, Batch, BatchOptions, Expected, Failure, Made, Worked, WorkOptions
 from lfpiv_cli.verbs.frames import residual_path
 
 
@@ -314,7 +314,7 @@ class PairByPair(Batch[Made]):
         every = list(dict.fromkeys(k for number in numbers for k in self._pairs[number]))
         frames = [self._found.targets[k] for k in every]
         left = [every[k] for k in pending(frames, self.inputs, self.overwrite, resume=True)] if every else []
-        self._whole = {k: batches.stamp_of(self._found.targets[k].path) for k in set(every) - set(left)}
+        self._whole = {k: stamp_of(self._found.targets[k].path) for k in set(every) - set(left)}
         steps = self._found.begin(left, console)
         self._drop(range(len(self._found.targets)))
         # Where all frames are there, what joins them is a step.
@@ -324,12 +324,12 @@ class PairByPair(Batch[Made]):
         """Make the files of two frames, where they are not there, and of these the result."""
         for k in self._pairs[number]:
             target = self._found.targets[k]
-            stamp = batches.stamp_of(target.path)
+            stamp = stamp_of(target.path)
             if stamp is None or self._whole.get(k) != stamp:
                 with shares.awaited(target.path):
                     if state_or_none(target) is not State.COMPLETE:
                         self._found.make(k, work)
-                self._whole[k] = batches.stamp_of(target.path)
+                self._whole[k] = stamp_of(target.path)
         joined = self._join(number, {})
         joined.begin([0], work.console)
         made = joined.make(0, work)

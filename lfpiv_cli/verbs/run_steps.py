@@ -17,7 +17,7 @@ from typing import Any
 from lfpiv_cli.console import Console
 from lfpiv_cli.errors import InputError, LfpivError, OutputExistsError, PartialError, StoppedEarlyError
 from lfpiv_cli.files import atomic
-from lfpiv_cli.files.batch import VTKHDF_SUFFIX, Frame, Target
+from lfpiv_cli.files.batch import VTKHDF_SUFFIX, Frame, Stamp, Target, stamp_of
 from lfpiv_cli.files.config import Config
 from lfpiv_cli.files.pairing import Pairs
 from lfpiv_cli.files.provenance import Gone, carried_record, same_result, sha256
@@ -25,7 +25,7 @@ from lfpiv_cli.files.shares import Deadline, awaited
 from lfpiv_cli.names import FlowMethod, Kept, RunMethod
 from lfpiv_cli.verbs import correlate as correlating
 from lfpiv_cli.verbs import track as tracking
-from lfpiv_cli.verbs.batches import ALL, BatchOptions, Failure, Stamp, carried_out, stamp_of, work_through
+from lfpiv_cli.verbs.batches import ALL, BatchOptions, Failure, carried_out, work_through
 from lfpiv_cli.verbs.build_weights import BuildWeightsOptions, build_weights_file
 from lfpiv_cli.verbs.calibrate import CalibrateOptions, calibrate_snapshot
 from lfpiv_cli.verbs.combine import combine_vectors
