@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 import lfpiv_cli as lf
 from lfpiv_cli.calibration import sheet
 from lfpiv_cli.calibration.board_pose import BoardGeometry, BoardPose
-from lfpiv_cli.calibration.light_checks import check_residual, residual_share
+from lfpiv_cli.calibration.lattice import fit_lattice
+from lfpiv_cli.calibration.light_checks import check_residual, residual_share, white_notices
 from lfpiv_cli.calibration.sheet import board_notices, check_f_numbers, image_distance_notices, sheet_fit
 from lfpiv_cli.calibration.white import lens_image_width
 from lfpiv_cli.console import Console
@@ -158,6 +159,10 @@ def test_width_of_lens_images_and_what_is_no_lattice(tmp_path: Path) -> None:
         assert found == pytest.approx(2.0 * radius / PITCH_PX, rel=0.03)
     with pytest.raises(InputError, match="off a lattice by .* not a white image"):
         codes(white(jitter_px=0.09 * PITCH_PX), tmp_path)
+    # Microlenses whose focal length is a tenth off the data sheet's, either way.
+    good = white() - 200.0
+    for width, found in ((0.87, []), (0.9, []), (0.81, ["aperture-not-as-told"]), (0.99, ["aperture-not-as-told"])):
+        assert [each.code for each in white_notices(good, fit_lattice(good), width, 0.9)] == found
 
 
 def test_residuals_and_f_numbers_that_are_refused(table2: Camera) -> None:
