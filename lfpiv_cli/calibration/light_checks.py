@@ -164,8 +164,8 @@ LARGEST_DIFFERENCE, DIFFERENCE_PERCENTILE, NEIGHBOURS = 0.08, 90.0, 4
 STANDING_OUT = 6.0
 # Of the brightest lens image: darker ones count as this bright, which is nothing.
 DARKEST = 1e-9
-# What the data sheet says of the lens images' width is believed to this factor: rendered ones were 0.96 to 1.00 times as
-# wide, and depths are off by as much as the f-number towards the array.
+# What the data sheet says of the lens images' width is believed to this factor: rendered ones were 0.96 to 1.00 times
+# as wide, and depths are off by as much as the f-number towards the array.
 WIDTH_TOLERANCE = 1.07
 
 IS_IT_WHITE = "photograph uniform light, out of focus, at two thirds of full scale"
