@@ -209,9 +209,9 @@ def searched(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(particles, name, search)
 
 
-def finder(pairing: str, keep_going: bool) -> particles.Finder:
+def finder(pairing: str, keep_going: bool, bad: int = BAD) -> particles.Finder:
     def read(number: int) -> tuple[Any, Any]:
-        if number == BAD:
+        if number == bad:
             raise InputError(f"f{number}.tif: is empty")
         return np.float32(number), np.float32(number)
 
@@ -220,6 +220,16 @@ def finder(pairing: str, keep_going: bool) -> particles.Finder:
         beside, first_of = [(1,), (0, 2), (1, 3), (2,)], {}
     frames = [Frame(Path(f"f{number}.tif"), 0, 1) for number in range(4)]
     return particles.Finder(None, read, frames, beside, first_of, keep_going)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("order", [(2, 3), (3, 2), (3,), (2,)])
+def test_the_order_of_a_pairs_frames_does_not_matter(searched, order: tuple[int, ...]) -> None:
+    pairs, wanted = finder("ab", False, bad=-1), {2: "2 beside 3 after 2", 3: "3 after 2 beside 2"}
+    for number in order:
+        assert pairs.find(number, number, lambda steps: None) == (wanted[number], [])  # type: ignore[arg-type]
+    # A sequence's frames stand alone at first.
+    alone = finder("sequence", False, bad=-1).find(1, 1, lambda steps: None)  # type: ignore[arg-type]
+    assert alone == ("1 beside 0 and 2", [])
 
 
 @pytest.mark.parametrize(

@@ -1,12 +1,9 @@
 """What frames beside one tell of its particles: found here too where they are there, and ghosts are not."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 from lfpiv_cli.arrays import Floats
-from lfpiv_cli.files.batch import Frame
 from lfpiv_cli.grid import Scale
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media
@@ -14,8 +11,7 @@ from lfpiv_cli.particles import neighbour_frames
 from lfpiv_cli.particles.neighbour_frames import Predicted, find_predicted, predicted_by, second_frame, second_pass
 from lfpiv_cli.particles.rounds import first_pass
 from lfpiv_cli.particles.search import Task
-from lfpiv_cli.verbs import particles as particles_interface
-from lfpiv_cli.verbs.particles import STEPS, Finder
+from lfpiv_cli.verbs.particles import STEPS
 from tests.particle_images import found, task_with
 
 MOVED = np.array([0.12, -0.05, 0.04, 0.0])
@@ -145,31 +141,3 @@ def test_the_second_frame_goes_on_from_the_first(table2: Camera, water: Media, r
     told.clear()
     np.testing.assert_array_equal(second_frame(task, before, strewn(rng), told.append), alone)
     assert sum(told) == STEPS
-
-
-@pytest.mark.thorough
-@pytest.mark.parametrize("order", [(0, 1), (1, 0), (1,), (0,)])
-def test_the_order_of_a_pairs_frames_does_not_matter(order: tuple[int, ...], monkeypatch: pytest.MonkeyPatch) -> None:
-    def first_of(bench: None, frame: int, advance: None) -> str:
-        return f"first {frame}"
-
-    def second_of(bench: None, frame: int, before: int, made: str, advance: None) -> str:
-        return f"second {frame} after {before}, {made}"
-
-    monkeypatch.setattr(particles_interface, "frame_of", lambda bench, raw, lit: raw)
-    monkeypatch.setattr(particles_interface, "find_first", first_of)
-    monkeypatch.setattr(particles_interface, "find_second", second_of)
-    monkeypatch.setattr(particles_interface, "find_beside", lambda bench, frame, own, beside: (own, beside))
-    monkeypatch.setattr(particles_interface, "check_frame", lambda bench, raw, name: None)
-    frames = [Frame(Path(f"{number}.tif"), 0, 1) for number in range(4)]
-
-    def finder(beside: list[tuple[int, ...]], first_of: dict[int, int]) -> Finder:
-        return Finder(None, lambda number: (number, number), frames, beside, first_of, keep_going=False)
-
-    second = "second 3 after 2, first 2"
-    wanted = {0: ("first 2", [second]), 1: (second, ["first 2"])}
-    pairs = finder([(1,), (0,), (3,), (2,)], {1: 0, 3: 2})
-    for number in order:
-        assert pairs.find(2 + number, 2 + number, None) == (wanted[number], [])
-    # A sequence's frames stand alone at first.
-    assert finder([(1,), (0,)], {}).find(1, 1, None) == (("first 1", ["first 0"]), [])
