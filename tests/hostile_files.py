@@ -1,7 +1,5 @@
 """Files that are damaged or made to do harm, and how a command ends that is given one."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -25,7 +23,7 @@ def ended(*arguments: object) -> tuple[int, str]:
 
 
 def make_no_file(path: Path, kind: str) -> None:
-    """Put at a path what is no file of ours: nothing (`missing`), a `folder`, a `pipe`, an `empty` file or `text`."""
+    """Put at a path what is no file of ours: a `folder`, a `pipe`, an `empty` file, `text`, or else nothing."""
     if kind == "folder":
         path.mkdir()
     elif kind == "pipe":

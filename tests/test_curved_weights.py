@@ -13,7 +13,7 @@ from lfpiv_cli.files.config import Config
 from lfpiv_cli.files.hdf5 import read_tree, write_tree
 from lfpiv_cli.files.vtkhdf import open_volume
 from lfpiv_cli.files.weights_file import FORMAT, UNITS, VERSION, WeightsFile, open_weights, write_weights
-from lfpiv_cli.grid import Grid, Reference
+from lfpiv_cli.grid import FOCAL_POINT, Grid
 from lfpiv_cli.optics.camera import Lattice
 from lfpiv_cli.optics.curved_space import CurvedSpace, Face
 from lfpiv_cli.optics.media import Window, fluid_path_to_focus
@@ -68,6 +68,13 @@ def adjoint_reference(operator: StripOperator, image: Singles) -> Floats:
 def tube(water):
     """A tube of 10 mm with a wall of 2 mm, along x."""
     return tube_of(water)
+
+
+@pytest.fixture(scope="module")
+def beside(table2, water):
+    """A camera, and its weights in strips beside the axis of such a tube."""
+    camera = replace(table2, columns=300)
+    return camera, operator_of(camera, tube_of(water), BESIDE)
 
 
 def differences_from_counts(camera, space, places, rays):
@@ -160,9 +167,8 @@ def test_strips_are_adjoint_and_light_what_columns_say(table2, water, rng, colum
     assert operator.misfit_l1.max() == pytest.approx(np.max(errors), abs=0.008)  # what it says of itself
 
 
-def test_strips_are_the_sum_of_their_columns(table2, tube, rng, one_thread):
-    camera = replace(table2, columns=400)
-    operator = operator_of(camera, tube, BESIDE)
+def test_strips_are_the_sum_of_their_columns(beside, rng, one_thread):
+    _, operator = beside
     volume, image = rng.random(operator.shape, np.float32), rng.random(operator.image_shape, np.float32)
     assert np.unique(operator.blocks.line).size > 1
     assert operator.blocks.plane.size > np.unique(operator.blocks.line).size  # parts of the aperture
@@ -282,11 +288,11 @@ def test_what_does_not_separate_is_made_on_demand(table2, tube, water):
 
 
 @pytest.mark.parametrize("operator_kind", ["strips", "on demand"])
-def test_a_weights_file_holds_them(table2, tube, tmp_path, operator_kind):
-    camera = replace(table2, columns=300)
-    operator = {"strips": operator_of, "on demand": OnDemandOperator}[operator_kind](camera, tube, BESIDE)
+def test_a_weights_file_holds_them(beside, tube, tmp_path, operator_kind):
+    camera, operator = beside
+    operator = operator if operator_kind == "strips" else OnDemandOperator(camera, tube, BESIDE)
     path = tmp_path / "weights.h5"
-    content = WeightsFile(Weights(BESIDE, (0, 0, 0), operator, "x"), camera, Reference("focal_point", 0.0), {})
+    content = WeightsFile(Weights(BESIDE, (0, 0, 0), operator, "x"), camera, FOCAL_POINT, {})
     write_weights(path, content, False)
     found = open_weights(path)
     for index in [(3, 5, 1), (6, 19, 0)]:
@@ -304,15 +310,6 @@ def test_a_weights_file_holds_them(table2, tube, tmp_path, operator_kind):
     assert (notice.code, notice.measured) == ("weights-inexact", 0.05)
 
 
-@pytest.fixture(scope="module")
-def strips(table2, water, tmp_path_factory):
-    """A file of weights in strips."""
-    path, camera = tmp_path_factory.mktemp("strips") / "weights.h5", replace(table2, columns=300)
-    weights = Weights(BESIDE, (0, 0, 0), operator_of(camera, tube_of(water), BESIDE), "x")
-    write_weights(path, WeightsFile(weights, camera, Reference("focal_point", 0.0), {}), False)
-    return path
-
-
 @pytest.mark.parametrize(
     ("group", "name", "value"),
     [
@@ -327,8 +324,11 @@ def strips(table2, water, tmp_path_factory):
         ("strips", "lit", np.ones((1, 2, 3), np.uint8)),
     ],
 )
-def test_strips_that_contradict_themselves_are_refused(strips, tmp_path, group, name, value):
-    tree, provenance = read_tree(strips, FORMAT, VERSION)
+def test_strips_that_contradict_themselves_are_refused(beside, tmp_path, group, name, value):
+    camera, operator = beside
+    content = WeightsFile(Weights(BESIDE, (0, 0, 0), operator, "x"), camera, FOCAL_POINT, {})
+    write_weights(tmp_path / "weights.h5", content, False)
+    tree, provenance = read_tree(tmp_path / "weights.h5", FORMAT, VERSION)
     tree[group][name] = tree[group][name] + int(value.split()[-1]) if isinstance(value, str) else value
     form = {"format_name": FORMAT, "format_version": VERSION, "units": UNITS}
     write_tree(tmp_path / "edited.h5", tree, **form, provenance=provenance, overwrite=False)
@@ -351,7 +351,7 @@ def test_a_weights_file_holds_every_kind_of_face(table2, water, tmp_path, surfac
     grid = Grid.centred((2, 2, 2), VOXEL, (0.0, 0.0, 0.0))
     path = tmp_path / "weights.h5"
     weights = Weights(grid, (0, 0, 0), OnDemandOperator(table2, space, grid), "x")
-    write_weights(path, WeightsFile(weights, table2, Reference("focal_point", 0.0), {}), False)
+    write_weights(path, WeightsFile(weights, table2, FOCAL_POINT, {}), False)
     assert open_weights(path).weights.solver_operator.source == space
 
 

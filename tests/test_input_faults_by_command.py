@@ -1,7 +1,5 @@
 """Inputs that are damaged, of another kind, or made to do harm, each through a command that reads them."""
 
-from __future__ import annotations
-
 import os
 import re
 import sys
@@ -18,70 +16,24 @@ import yaml
 from lfpiv_cli.files import particle_file
 from lfpiv_cli.files.hdf5 import DIGEST, read_tree, write_tree
 from lfpiv_cli.files.images import count_pages
-from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, TRACKS_FORMAT, TRAJECTORIES_FORMAT, UNITS, Points
+from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, TRACKS_FORMAT, TRAJECTORIES_FORMAT
 from lfpiv_cli.files.vtkhdf import open_vectors, write_vectors, write_volume
 from lfpiv_cli.files.weights_file import FORMAT, VERSION
 from lfpiv_cli.files.weights_file import UNITS as WEIGHT_UNITS
 from lfpiv_cli.grid import FOCAL_POINT, Grid
 from tests.commands import CONFIG, SAMPLE
 from tests.hostile_files import edited, ended
-from tests.vector_fields import SHAPE, field_of
-
-# Inputs that are no file of the kind
+from tests.vector_fields import SHAPE, field_of, points_of
 
 
-COMMANDS = {
-    "a config": ("build-weights", "{input}"),
-    "an image": ("check", CONFIG, "{input}"),
-    "a white image": ("calibrate-snapshot", CONFIG, "--white", "{input}"),
-    "weights": ("reconstruct", "{input}", SAMPLE / "pair_a.tif"),
-    "a page": ("report", "{input}"),
-    "frames": ("reconstruct", SAMPLE / "no.h5", "{input}"),
-    "volumes": ("correlate", "{input}", "{input}"),
-    "particles": ("track", "{input}", "{input}"),
-    "vectors": ("combine", "{input}", "{input}"),
-    "vectors to judge": ("validate", "flow", CONFIG, "--vectors", "{input}"),
-    "what is exported": ("export", "{input}", "--to", "csv"),
-}
-
-
-@pytest.mark.parametrize("what", COMMANDS)
-def test_a_name_that_is_too_long_is_refused_by_each_command(tmp_path: Path, what: str) -> None:
-    path = tmp_path / f"{'x' * 300}input.tif"
-    words = [str(word).format(input=path) for word in COMMANDS[what]]
-    output = tmp_path / ("output.vtkhdf" if what in ("weights", "volumes", "particles", "vectors") else "output.html")
-    words += [] if words[0] == "check" else ["-o", str(output)]
-    code, said = ended(*words)
-    assert (code, "input.tif" in said) == (4, True), said
-    assert not output.exists()
-
-
-@pytest.mark.parametrize(
-    "command",
-    [
-        ("check", "{input}"),
-        ("build-weights", "{input}", "-o", "{output}"),
-        ("calibrate-snapshot", "{input}", "--white", SAMPLE / "white.tif", "-o", "{output}"),
-        ("run", "{input}", *[SAMPLE / "pair_a.tif"] * 2, "--white", SAMPLE / "white.tif", "-o", "{output}"),
-        ("simulate", "white", "{input}", "-o", "{output}"),
-        ("validate", "board", "{input}", "-o", "{output}"),
-        ("correlate", "{volume}", "{copy}", "--config", "{input}", "-o", "{output}.vtkhdf"),
-    ],
-    ids=lambda command: command[0],
-)
-def test_an_image_or_a_result_in_place_of_a_config_is_told(tmp_path: Path, command: tuple[object, ...]) -> None:
-    volume, copy, png = tmp_path / "v.vtkhdf", tmp_path / "copy.vtkhdf", tmp_path / "rig.png"
-    grid = Grid.centred((3, 3, 3), (0.1,) * 3, (0.0,) * 3)
-    write_volume(volume, np.ones((3, 3, 3)), grid, FOCAL_POINT, provenance={}, attributes={}, overwrite=False)
-    copy.write_bytes(volume.read_bytes())
-    png.write_bytes(imagecodecs.png_encode(np.ones((9, 9), np.uint8)))
-    kinds = {SAMPLE / "white.tif": "an image (TIFF)", png: "an image (PNG)", volume: "an HDF5 file"}
-    for given, kind in kinds.items():
-        words = [
-            str(word).format(input=given, output=tmp_path / "output", volume=volume, copy=copy) for word in command
-        ]
-        assert ended(*words) == (3, f"{given}: is {kind}; expected a rig file")
-    assert sorted(os.listdir(tmp_path)) == ["copy.vtkhdf", "rig.png", "v.vtkhdf"]
+@pytest.mark.parametrize("kind", ["an image (TIFF)", "an image (PNG)", "an HDF5 file"])
+def test_what_stands_in_place_of_a_config_is_told(tmp_path: Path, kind: str) -> None:
+    given = SAMPLE / "white.tif" if "TIFF" in kind else tmp_path / "given"
+    if "PNG" in kind:
+        given.write_bytes(imagecodecs.png_encode(np.ones((9, 9), np.uint8)))
+    elif "HDF5" in kind:
+        h5py.File(given, "w").close()
+    assert ended("check", given) == (3, f"{given}: is {kind}; expected a rig file")
 
 
 def correlated(folder: Path, value: float, other: float) -> tuple[int, str]:
@@ -160,19 +112,6 @@ PROVENANCE = {"command": "test", "config": {"numbers": list(range(2000))}}
 KINDS = ("vectors", "volume", "particles", "tracks", "trajectories", "weights")
 
 
-def points(format_name: str, count: int = 9) -> Points:
-    """Return points with made-up quantities."""
-    rng = np.random.default_rng(2)
-    wide = {"covariance_mm2": 6, "velocity": 3, "velocity_sigma": 3, "displacement_mm": 3}
-    whole = {"flag", "particle_a", "particle_b", "track", "frame", "particle"}
-    arrays = {
-        name: np.arange(count) if name in whole else rng.random((count, wide[name]) if name in wide else count)
-        for name in UNITS[format_name]
-    }
-    told = {"dt_s": 0.1, "residual": 0.1, "refraction": "exact", "excluded_pixels": 0, "read_noise_counts": 1.0}
-    return Points(rng.random((count, 3)), arrays, FOCAL_POINT, told | {"particle_diameter_mm": 0.1}, PROVENANCE)
-
-
 def write_kind(path: Path, kind: str) -> None:
     """Write a small file of a kind."""
     rng = np.random.default_rng(1)
@@ -192,7 +131,9 @@ def write_kind(path: Path, kind: str) -> None:
         assert ended("build-weights", rig, "-o", path) == (0, "")
     else:
         names = {"particles": PARTICLES_FORMAT, "tracks": TRACKS_FORMAT, "trajectories": TRAJECTORIES_FORMAT}
-        particle_file.write_points(path, names[kind], points(names[kind]), overwrite=False)
+        told = {"dt_s": 0.1, "residual": 0.1, "refraction": "exact", "excluded_pixels": 0, "read_noise_counts": 1.0}
+        made = points_of(names[kind], rng, provenance=PROVENANCE, particle_diameter_mm=0.1, **told)
+        particle_file.write_points(path, names[kind], made, overwrite=False)
 
 
 @pytest.fixture(scope="module")

@@ -4,8 +4,6 @@ A new command, or a new place for a file in one, is a line in `PLACES`; a new ki
 what writes it; a new format of exports is one in `READERS`.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import shutil
@@ -22,11 +20,11 @@ from lfpiv_cli.cli.main import COMMANDS
 from lfpiv_cli.cli.options import FILE
 from lfpiv_cli.files.export_formats import FORMATS, read_content
 from lfpiv_cli.names import ExportFormat, names_in
+from tests.commands import ROOT
 from tests.hostile_files import ended, make_no_file
 from tests.read_back import READERS, by_hdf5
 from tests.written_files import KINDS, WrittenFiles
 
-ROOT = Path(__file__).parent.parent
 RIGS = {"rig", "rig by init"}
 IMAGES = {"white image", "dark image", "board image", "frame", "residual image"}
 CALIBRATIONS = {"calibration", "fitted rays", "refined calibration"}
@@ -52,7 +50,7 @@ RESULTS = {"volume", *VECTORS, *PARTICLES, *TRACKS}
 DRAWN = RESULTS | CALIBRATIONS | WEIGHTS
 
 # What is no file; a folder is one to places that take files by the thousand, but holds none.
-NO_FILES = ("missing", "empty", "folder", *(["pipe"] if hasattr(os, "mkfifo") else []))
+NO_FILES = ("missing", "too long a name", "empty", "folder", *(["pipe"] if hasattr(os, "mkfifo") else []))
 
 
 @dataclass(frozen=True)
@@ -179,15 +177,15 @@ def outcome(files: WrittenFiles, place: Place, kind: str) -> str:
         given, out = Path(folder) / "given", Path(folder) / "out"
         given.mkdir()
         out.mkdir()
-        path = given / ("given" if kind in NO_FILES else files.path(kind).name)
+        path = given / (files.path(kind).name if kind in KINDS else "x" * 300 if "long" in kind else "given")
         if kind in NO_FILES:
             make_no_file(path, kind)
         else:
             shutil.copy(files.path(kind), path)
-        before = path.read_bytes() if path.is_file() else b""
+        before = path.read_bytes() if os.path.isfile(path) else b""
         words = files.words(place.words.replace("{out}", str(out)), given if place.in_folder else path)
         code, said = ended(*words)
-        if (path.read_bytes() if path.is_file() else b"") != before or len(os.listdir(given)) > 1:
+        if (path.read_bytes() if os.path.isfile(path) else b"") != before or len(os.listdir(given)) > 1:
             return f"changes its input ({code})"
         if code == 0:
             return "ok"
