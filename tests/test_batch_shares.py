@@ -51,7 +51,7 @@ def bytes_of(folder: Path | list[Path]) -> dict[str, bytes]:
 
 
 @pytest.mark.thorough
-def test_shards_give_what_one_command_gives(
+def test_shards_give_one_command_s_files(
     weights: Path, frames: list[Path], volumes: list[Path], tmp_path: Path
 ) -> None:
     for number in (3, 1, 2):

@@ -299,9 +299,7 @@ def test_fitted_rays_meet_the_array_where_traced_ones_do_eq_1(
 
 
 @pytest.mark.thorough
-def test_boards_at_several_depths_show_the_entrance_pupil_and_rays_are_fitted_behind_it(
-    table2: Camera, water: Media, rng: np.random.Generator
-) -> None:
+def test_boards_at_several_depths_show_the_pupil(table2: Camera, water: Media, rng: np.random.Generator) -> None:
     """A lens of P = 1.3, told as a thin one: its entrance pupil is 100 (1/1.3 + 1) = 176.9 mm away, not 200."""
     told = replace(sensor_of(table2), aperture_mm=22.0)
     seen_by = thin_lens(told, 1.0 / 1.3)
@@ -324,9 +322,7 @@ def test_boards_at_several_depths_show_the_entrance_pupil_and_rays_are_fitted_be
 
 
 @pytest.mark.parametrize("entrance_over_exit", [1.25, 1.0, 0.6, 0.0])
-def test_the_entrance_pupil_follows_from_how_boards_shrink(
-    table2: Camera, rng: np.random.Generator, entrance_over_exit
-) -> None:
+def test_shrinking_boards_tell_the_pupil(table2: Camera, rng: np.random.Generator, entrance_over_exit) -> None:
     camera = thin_lens(replace(table2, magnification=-0.6), entrance_over_exit)
     plate = rng.uniform(-2.0, 2.0, (9, 2))
     dot, crossing = np.repeat(np.arange(9), 20), rng.uniform(-9.0, 9.0, (180, 2))
@@ -345,9 +341,7 @@ def test_the_entrance_pupil_follows_from_how_boards_shrink(
 
 
 @pytest.mark.thorough
-def test_three_depths_give_degree_two_and_two_are_refused(
-    table2: Camera, water: Media, rng: np.random.Generator
-) -> None:
+def test_three_depths_give_degree_two_two_none(table2: Camera, water: Media, rng: np.random.Generator) -> None:
     camera = sensor_of(table2)
     images = pictures(camera, water, rng, [BoardPlacement(z) for z in (-4.0, 0.5, 5.0)])
     assert fit_rays(images, (-4.0, 0.5, 5.0), camera, SMALL_BOARD, water).rays.degree == 2

@@ -114,9 +114,7 @@ def work(name: str, folder: Path, pairs: list[Path], rng: np.random.Generator) -
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="no SIGKILL")
 @pytest.mark.parametrize("name", NAMES)
-def test_what_was_killed_can_be_made_again(
-    tmp_path: Path, pairs: list[Path], name: str, rng: np.random.Generator
-) -> None:
+def test_what_was_killed_is_made_again(tmp_path: Path, pairs: list[Path], name: str, rng: np.random.Generator) -> None:
     words, end, takes_s = work(name, tmp_path, pairs, rng)
     folder = tmp_path / "out"
     made, whole = folder / f"made{end}", tmp_path / f"made{end}"

@@ -42,9 +42,7 @@ def picture(path: Path, value: float) -> Path:
 @pytest.mark.thorough
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e300, 1e30])
 @pytest.mark.parametrize("option", ["--dark", "--background", "--mask"])
-def test_a_reference_without_counts_is_the_inputs_fault(
-    tmp_path: Path, weights: Path, option: str, value: float
-) -> None:
+def test_a_reference_without_counts_is_refused(tmp_path: Path, weights: Path, option: str, value: float) -> None:
     image = picture(tmp_path / "reference.tif", value)
     code, said = ended("reconstruct", weights, SAMPLE / "pair_a.tif", option, image, "-o", tmp_path / "v.vtkhdf")
     assert (code, "reference.tif: 1 of its 268800 pixels are not counts" in said) == (4, True), said

@@ -159,9 +159,7 @@ def test_haze_fainter_than_a_pixel_s_noise_is_found(camera: Camera, water: Media
 
 
 @pytest.mark.parametrize("photons_per_count", [0.5, 0.01])
-def test_tracers_are_no_haze_however_many(
-    camera: Camera, water: Media, rng: np.random.Generator, photons_per_count: float
-):
+def test_tracers_are_no_haze(camera: Camera, water: Media, rng: np.random.Generator, photons_per_count: float):
     """Of four for each microlens a third of the light is in the darkest pixels of all."""
     camera = replace(camera, columns=400, rows=320)
     _, white = white_of(camera, rng)

@@ -113,9 +113,7 @@ def test_partners_are_found_as_far_as_tracers_go_at_any_magnification(
 
 
 @pytest.mark.parametrize(("count", "least"), [(1, 0.0), (3, 0.0), (6, 0.9), (30, 0.97)])
-def test_few_tracers_that_go_far_are_linked_rightly_or_not_at_all(
-    count: int, least: float, rng: np.random.Generator
-) -> None:
+def test_few_far_tracers_are_linked_rightly_or_not(count: int, least: float, rng: np.random.Generator) -> None:
     """They move by 11 of the view's 40 x 30 microlenses; half as many others are there."""
     box, sigma = TABLE2_SCALE.box_mm(1.0, 1.0) * (40.0, 30.0, 4.0), TABLE2_SCALE.box_mm(0.02, 0.05)
     right, wrong, trials = 0, 0, 40

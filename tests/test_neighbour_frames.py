@@ -106,7 +106,7 @@ def test_what_fits_and_finds_its_light_is_beyond_doubt(table2: Camera, water: Me
 
 
 @pytest.mark.thorough
-def test_particles_are_expected_where_the_flow_takes_them_and_not_where_neighbours_move_otherwise(
+def test_particles_are_expected_where_the_flow_takes_them(
     rng: np.random.Generator,
 ) -> None:
     trusted = strewn(rng, 60)

@@ -88,9 +88,7 @@ def test_documents_list_all_codes() -> None:
 
 
 @pytest.mark.thorough
-def test_a_warning_is_on_the_terminal_in_json_and_in_the_file(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_warning_is_printed_in_json_and_in_the_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_tiff(tmp_path / "white.tif", white(radius_px=2.5), overwrite=False)
     output = tmp_path / "c.h5"
     (tmp_path / "rig.yaml").write_text(RIG)
@@ -268,9 +266,7 @@ def test_microscope_objectives(na: float, told: list[str] | None, tmp_path: Path
         assert [each.code for each in plan_of(load_rig(tmp_path / "rig.yaml"), None).notices] == told
 
 
-def test_refraction_error_is_the_papers_aberration_and_sine_error_that_of_two_rays(
-    table2: Camera, water: Media, window: Window
-) -> None:
+def test_refraction_and_sine_errors_are_those_of_two_rays(table2: Camera, water: Media, window: Window) -> None:
     # 0.085 mm of apparent depth at the edge of an f/4 lens through 134 mm of water, under the rim's slope
     error = refraction_error_mm(table2, water, window, np.zeros(1))
     assert error == pytest.approx(0.085 * 12.5 / 200.0, rel=0.05)
@@ -320,9 +316,7 @@ def test_columns_on_demand_cost_more_than_factors(tmp_path: Path) -> None:
         (100, 0.0, {"light_b_over_a": 1.26}, ["light-unequal"]),
     ],
 )
-def test_doubtful_links_and_bent_tracks_are_told(
-    tracks: int, wrong: float, more: dict[str, Any], told: list[str]
-) -> None:
+def test_doubtful_links_and_bends_are_told(tracks: int, wrong: float, more: dict[str, Any], told: list[str]) -> None:
     summary = {"tracks": tracks, "expected_wrong_links": wrong} | more
     assert [notice.code for notice in doubt_notices(summary, "a")] == told
 

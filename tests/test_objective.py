@@ -137,9 +137,7 @@ def test_a_white_image_tells_of_the_objective(
     assert [each.code for each in told] == ([] if code is None else [code])
 
 
-def test_cut_and_growth_are_those_of_the_corners_and_falloff_leaves_the_pitch_as_it_is(
-    small: Camera, rng: np.random.Generator
-) -> None:
+def test_cut_and_growth_are_those_of_the_corners(small: Camera, rng: np.random.Generator) -> None:
     camera = with_objective(small, vignetting=0.2)
     # the fit is a parabola in the image height, the cut grows in proportion to it
     assert shapes_in(white_of(camera, rng)).cut.value == pytest.approx(0.2, abs=0.03)

@@ -36,9 +36,7 @@ MARGIN_PX = 3
 @pytest.mark.parametrize(
     ("wall", "is_deep", "sign"), [("near", True, -1), ("far", True, 1), ("low", False, -1), ("high", False, 1)]
 )
-def test_bubbles_touch_their_wall_and_stay_in_the_channel(
-    rng: np.random.Generator, axis: int, wall: Surface, is_deep, sign
-) -> None:
+def test_bubbles_touch_their_wall_alone(rng: np.random.Generator, axis: int, wall: Surface, is_deep, sign) -> None:
     walls = channel_walls(4.0, -0.3, axis)
     seen = Box((-1.0, -2.0, -2.3), (1.0, 2.0, 1.7)) if axis == "x" else Box((-2.0, -1.0, -2.3), (2.0, 1.0, 1.7))
     found = bubbles_at_wall(50, (0.2, 0.6), wall, seen, walls, rng)

@@ -123,9 +123,7 @@ def test_the_planted_mistakes_are_those_that_are_told():
     [((1.0, 1.0, 1.0), 0), ((-1.0, -1.0, -1.0), 8), ((-1.0, 1.0, 1.0), 8), ((1.0, 1.0, -1.0), 8)],
     ids=["no mistake", "pair swapped", "column axis mirrored", "z of the wrong sign"],
 )
-def test_validate_flow_fails_on_velocities_of_the_wrong_sign(
-    signs: tuple[float, float, float], exit_code: int, tmp_path: Path
-):
+def test_velocities_of_the_wrong_sign_miss_limits(signs: tuple[float, float, float], exit_code: int, tmp_path: Path):
     flow = {"kind": "shear", "along": "x", "across": "z", "rate_per_s": 20.0, "velocity_m_s": [0.1, 0.0, 0.05]}
     limits = {"streamwise_mean_error": 0.05, "within_25_percent_vector": 0.9}
     config, vectors = tmp_path / "rig.yaml", tmp_path / "vectors.vtkhdf"

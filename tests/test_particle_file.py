@@ -146,9 +146,7 @@ def test_files_are_those_of_tracks_in_memory(
     assert len(list(tmp_path.iterdir())) == 4
 
 
-def test_a_block_of_tracks_is_read_at_a_time(
-    many_tracks: Points, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_tracks_are_read_block_by_block(many_tracks: Points, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(particle_file, "BLOCK_ROWS", 20)
     with put(tmp_path, many_tracks) as stored:
         pieces = list(stored.rows("track"))
@@ -179,7 +177,7 @@ def test_no_tracks_are_written_too(tmp_path: Path) -> None:
     assert read_points(tmp_path / "t.vtkhdf", particle_file.TRACKS_FORMAT).position_mm.shape == (0, 3)
 
 
-def test_a_full_disk_and_a_folder_that_takes_nothing_are_told(
+def test_full_disks_and_lost_folders_are_told(
     many_tracks: Points, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with pytest.raises(OutputError, match="missing: tracks cannot be put there"):

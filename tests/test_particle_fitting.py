@@ -255,9 +255,7 @@ def test_a_particle_at_a_wrong_depth_finds_its_own(view: View, wrong: float) -> 
 
 
 @pytest.mark.thorough
-def test_tiles_share_no_pixel_and_the_result_does_not_depend_on_threads(
-    view: View, rng: np.random.Generator, one_thread
-) -> None:
+def test_tiles_share_no_pixel_whatever_the_threads(view: View, rng: np.random.Generator, one_thread) -> None:
     particles = scattered(80, rng)
     groups = groups_of_tiles(view, particles, DEPTHS)
     tiles = [numbers for group in groups for numbers in group]

@@ -179,9 +179,7 @@ def told(small_camera: Camera, water: Media, times: float, count: int, rng: np.r
     return focal_length_of(view, particles, image - image_of_all(view, particles), 1.0 / variance)
 
 
-def test_another_focal_length_is_seen_by_many_tracers(
-    small_camera: Camera, water: Media, rng: np.random.Generator
-) -> None:
+def test_many_tracers_show_the_focal_length(small_camera: Camera, water: Media, rng: np.random.Generator) -> None:
     found = told(small_camera, water, 0.98, 15, rng)
     assert found is not None
     # One step from 2 % away falls short of it by what the light is not linear in, a tenth.

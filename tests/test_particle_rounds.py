@@ -82,9 +82,7 @@ def scaled(camera: Camera, factor: float) -> Camera:
 
 
 @pytest.mark.thorough
-def test_the_same_image_in_a_larger_world_shows_the_same(
-    table2: Camera, water: Media, rng: np.random.Generator
-) -> None:
+def test_a_larger_world_shows_the_same(table2: Camera, water: Media, rng: np.random.Generator) -> None:
     camera = replace(table2, columns=200, rows=180)
     # Some overlap, some lie near the focal plane: candidates, splitting, other depths and merging all take part.
     true = rng.uniform((-0.4, -0.35, -0.6, 3e5), (0.4, 0.35, 1.3, 6e5), (12, 4))
@@ -106,9 +104,7 @@ def test_the_same_image_in_a_larger_world_shows_the_same(
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("seed", [0, 1])
-def test_a_single_tracer_is_found_in_a_volume_that_is_partly_out_of_view(
-    table2: Camera, water: Media, seed: int
-) -> None:
+def test_a_single_tracer_is_found_in_a_volume_partly_out_of_view(table2: Camera, water: Media, seed: int) -> None:
     """Where a voxel is hardly seen, noise is explained by more light than any tracer has."""
     rng = np.random.default_rng(seed)
     camera = replace(table2, columns=160, rows=160)
@@ -262,7 +258,7 @@ def test_crowded_tracers_are_told_apart_and_their_errors_are_covered(table2: Cam
 
 
 @pytest.mark.thorough
-def test_tracers_beyond_the_volume_are_found_there_and_hurt_no_other(table2: Camera, water: Media) -> None:
+def test_tracers_beyond_the_volume_are_found_there(table2: Camera, water: Media) -> None:
     # Two thirds lie up to 1 mm outside. Held within 0.3 mm of it, 22 ended there, and depths of those inside were seven
     # times as far off.
     rng = np.random.default_rng(3)
@@ -283,9 +279,7 @@ def test_tracers_beyond_the_volume_are_found_there_and_hurt_no_other(table2: Cam
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("waves", [None, Waves(532e-6)])
-def test_what_another_physics_leaves_is_alike_in_pixels_side_by_side(
-    table2: Camera, water: Media, waves: Waves | None
-) -> None:
+def test_what_another_physics_leaves_is_alike(table2: Camera, water: Media, waves: Waves | None) -> None:
     # By waves 0.065 to 0.11 of the light near the focal plane, 0.6 of its depths covered; by rays up to 0.05.
     rng = np.random.default_rng(0)
     camera = replace(table2, columns=240, rows=220)

@@ -281,9 +281,7 @@ def moved(path: Path) -> np.ndarray:
     return np.median(read_points(path, TRACKS_FORMAT).arrays["displacement_mm"], axis=0)
 
 
-def test_each_pair_has_a_file_whatever_becomes_of_others(
-    particles: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_each_pair_has_a_file_of_its_own(particles: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder, failures = tmp_path / "tracks", tmp_path / "failures.json"
     batch = ("track", particles, "--pairing", "ab", "--grid", "-o", folder)
     (particles / "b1.vtkhdf").unlink()
@@ -300,9 +298,7 @@ def test_each_pair_has_a_file_whatever_becomes_of_others(
 
 
 @pytest.mark.thorough
-def test_what_is_complete_with_its_vectors_is_skipped(
-    particles: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_is_complete_is_skipped(particles: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = tmp_path / "tracks"
     batch = ("track", particles, "--pairing", "ab", "-o", folder, "--json")
     run(*batch)

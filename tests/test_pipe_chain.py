@@ -103,9 +103,7 @@ ASLANT = "axis: [1, -0.0043634, 0.0043634]"
 
 
 @pytest.mark.slow
-def test_a_pipe_that_is_not_where_it_was_said_is_found_and_measured(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_pipe_that_lies_elsewhere_is_found(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Images of one pipe, the rig file of another: its axis is found, and with it the flow is right."""
     told = (CONFIGS / "pipe.yaml").read_text()
     for old, new in {
@@ -200,9 +198,7 @@ def test_a_wrong_mid_plane_is_found_and_mended(wrong: Path, tmp_path: Path, caps
 
 
 @pytest.mark.slow
-def test_half_a_millimetre_on_the_recorded_pair(
-    data_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_half_a_millimetre_on_the_pair(data_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     data, config = data_folder / "channel", ROOT / "configs" / "channel.yaml"
     dark, off = ("--dark", data / "dark.tif"), tmp_path / "off.h5"
     stills = ("--white", data / "white.tif", "--board", data / "board.tif")

@@ -123,9 +123,7 @@ def test_an_address_space_that_the_libraries_do_not_fit_into_is_told(tmp_path: P
     assert "too little memory: the address space of this process is limited to 0.51 GB" in done.stderr
 
 
-def test_too_little_memory_is_no_bug_and_an_input_that_may_not_be_read_gives_4(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_too_little_memory_is_no_bug_nor_are_locked_inputs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     image = tmp_path / "secret.tif"
     image.write_bytes((SAMPLE / "white.tif").read_bytes())
     allowed = os.access
@@ -276,9 +274,7 @@ def test_a_rig_file_is_written_though_nothing_can_be_said(tmp_path: Path, closed
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no device that is always full")
 @pytest.mark.thorough
 @pytest.mark.parametrize(("closed", "code"), [("| true", 0), (">&-", 0), (">/dev/full", 7)])
-def test_an_answer_that_is_lost_is_a_failure_but_for_a_reader_that_has_gone(
-    tmp_path: Path, closed: str, code: int
-) -> None:
+def test_a_lost_answer_fails_but_for_a_reader_that_has_gone(tmp_path: Path, closed: str, code: int) -> None:
     done = shell(f"{LFPIV} check '{CONFIG}' --json {closed}")
     assert done.returncode == code
     assert ("stdout: cannot be written: No space left on device" in done.stderr) == (code == 7)

@@ -82,9 +82,7 @@ def written(kind: str, folder: Path, rng: np.random.Generator) -> tuple[Path, np
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("kind", KINDS)
-def test_each_format_gives_the_counts_and_times_that_were_written_and_pages_as_images(
-    tmp_path: Path, rng: np.random.Generator, kind: str
-) -> None:
+def test_each_format_gives_its_counts_times_and_pages(tmp_path: Path, rng: np.random.Generator, kind: str) -> None:
     path, stack = written(kind, tmp_path, rng)
     found = images.frames(path)
     assert (found.pages, found.shape) == (3, (5, 7))
@@ -127,9 +125,7 @@ def test_a_recording_cut_anywhere_is_refused_by_its_name(tmp_path: Path, rng: np
 @pytest.mark.parametrize("bits", PACKED_BITS)
 @pytest.mark.parametrize("packing", ["high-first", "low-first"])
 @pytest.mark.parametrize("columns", [1, 4, 7, 8])
-def test_packed_pixels_are_what_their_bits_say_one_by_one(
-    rng: np.random.Generator, bits: int, packing: Packing, columns: int
-) -> None:
+def test_packed_pixels_are_their_bits(rng: np.random.Generator, bits: int, packing: Packing, columns: int) -> None:
     pixels = Pixels((3, columns), bits, packing)
     data, expected = rng.bytes(pixels.frame_bytes), []
     for k in range(3 * columns):

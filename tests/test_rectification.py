@@ -187,9 +187,7 @@ def image(small: Camera, water: Media, rng: np.random.Generator) -> Floats:
     return points_counted(start, small, water, rng)
 
 
-def test_refocused_at_its_depth_a_point_is_sharp_and_views_stand_in_the_order_of_their_points(
-    small: Camera, water: Media, image
-) -> None:
+def test_refocused_at_its_depth_a_point_is_sharp_and_views_in_order(small: Camera, water: Media, image) -> None:
     depths = (0.0, 2.0, 4.0, 6.0, 8.0)
     stack = refocused_stack(image, small, water, depths)
     assert np.argmax(np.sum(stack**2, axis=(1, 2))) == 2

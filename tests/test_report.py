@@ -144,9 +144,7 @@ def test_a_view_has_faint_lines_where_errors_are_large_walls_and_one_script() ->
     assert len(lines_view(lines)) > len(plain) + 1_000_000
 
 
-def test_pictures_are_drawn_on_the_raw_image_that_a_file_was_made_from(
-    results: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_pictures_are_drawn_on_their_raw_image(results: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     image, other = results / "image.tif", results / "other.tif"
     for counts, path in enumerate((image, other)):
         write_tiff(path, np.full((2, 3), counts, np.uint8), overwrite=False)
@@ -168,9 +166,7 @@ def test_pictures_are_drawn_on_the_raw_image_that_a_file_was_made_from(
 
 @pytest.mark.thorough
 @pytest.mark.parametrize(("commands", "word"), [(("track", "correlate"), "good"), (("correlate", "correlate"), "look")])
-def test_poor_vectors_count_unless_better_ones_stand_beside_them(
-    commands: tuple[str, str], word: str, tmp_path: Path
-) -> None:
+def test_poor_vectors_count_unless_better_ones_do(commands: tuple[str, str], word: str, tmp_path: Path) -> None:
     flow = np.zeros((*SHAPE, 3))
     flow[..., 0] = 1.0
     for name, command, sigma in zip("ab", commands, (SIGMA_VOXEL, [0.05, 0.02, 1.2]), strict=True):
@@ -193,9 +189,7 @@ def test_vectors_of_different_times_are_not_held_against_each_other(tmp_path: Pa
 
 
 @pytest.mark.thorough
-def test_of_all_but_the_best_vectors_one_figure_is_drawn(
-    results: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_all_but_the_best_have_one_figure(results: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(stage, "figures_of", figures_of)
     drawn: list[str] = []
 
@@ -212,9 +206,7 @@ def test_of_all_but_the_best_vectors_one_figure_is_drawn(
     assert (drawn.count("grid.vtkhdf"), drawn.count("vectors.vtkhdf")) == (3, 1)
 
 
-def test_the_first_line_tells_how_much_how_fast_how_well_and_what_is_against_it(
-    results: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_first_line_tells_all_at_once(results: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pages: list[Page] = []
     monkeypatch.setattr(stage, "write_pages", lambda page, *_given: pages.append(page))
     report(results, tmp_path / "page.html", console=QUIET)
@@ -267,9 +259,7 @@ def test_the_verdict_is_of_tracks_where_volumes_beside_them_are_poor(tmp_path: P
     assert "look" in {line.verdict for line in judged(alone, dict(list(fields.items())[1:]))["vectors"]}
 
 
-def test_many_pairs_stand_in_their_order_and_settings_have_no_empty_ones(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_many_pairs_stand_in_order_without_empty_settings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pages: list[Page] = []
     monkeypatch.setattr(stage, "write_pages", lambda page, *_given: pages.append(page))
     made = record("correlate")

@@ -70,9 +70,7 @@ def inside(path: Path, *left_out: str) -> dict[str, Any]:
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("kind", OPENED)
-def test_what_is_opened_is_described_saved_and_drawn_as_its_file(
-    files: WrittenFiles, kind: str, tmp_path: Path
-) -> None:
+def test_what_is_opened_is_saved_and_drawn_as_its_file(files: WrittenFiles, kind: str, tmp_path: Path) -> None:
     path, saved = files.path(kind), tmp_path / "saved.h5"
     result = OPENED[kind](path)
     said = repr(result).splitlines()

@@ -105,9 +105,7 @@ def test_what_is_done_is_kept_with_its_summary_and_what_is_lost_is_made_again(ag
 
 
 @pytest.mark.thorough
-def test_a_person_is_told_in_m_per_s_what_was_made_and_what_to_open_and_a_program_all(
-    again: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_person_is_told_what_was_made_and_a_program_all(again: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = ["run", again / "rig.yaml", *PAIR, *PHOTOGRAPHS, "--method", "volumes", "-o", again / "out"]
     capsys.readouterr()
     lfpiv(*words)
@@ -261,9 +259,7 @@ def test_the_report_is_made_of_what_was_made(again: Path, monkeypatch: pytest.Mo
 
 
 @pytest.mark.thorough
-def test_results_are_kept_without_their_volumes_and_whatever_fails(
-    again: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_results_are_kept_without_volumes_whatever_fails(again: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     images = again / "images"
     images.mkdir()
     for name, source in (("pair_a", 0), ("pair_b", 1), ("next_a", 0), ("next_b", 1), ("lost_a", 0)):

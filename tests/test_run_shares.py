@@ -77,9 +77,7 @@ def test_shards_together_give_what_one_command_gives(rig, whole, with_weights, o
 
 @pytest.mark.thorough
 @pytest.mark.filterwarnings("ignore::ResourceWarning")
-def test_workers_of_a_scheduler_give_what_one_command_gives(
-    rig: Path, whole: Path, with_weights: Path, in_process: str
-) -> None:
+def test_workers_give_one_command_s_files(rig: Path, whole: Path, with_weights: Path, in_process: str) -> None:
     run(rig, with_weights, "--dask", in_process, "--keep", "results")
     assert data_of(with_weights) == {name: data for name, data in data_of(whole).items() if "volumes" not in name}
     shutil.rmtree(with_weights / "vectors")
@@ -146,9 +144,7 @@ def planned(rig: Path, output: Path, capsys: pytest.CaptureFixture[str], *option
     return dict(json.loads(capsys.readouterr().out))
 
 
-def test_a_dry_run_before_there_is_anything_and_a_sequence_is_not_divided(
-    rig: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_dry_run_before_there_is_anything(rig: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     told = planned(rig, tmp_path / "out", capsys, "--shard", "1/3")
     assert not (tmp_path / "out").exists()
     assert told["steps_to_make"] == ["calibrate-snapshot", "build-weights"]
@@ -209,9 +205,7 @@ def test_volumes_that_another_worker_needs_stay(rig: Path, with_weights: Path) -
 
 
 @pytest.mark.thorough
-def test_the_folder_of_volumes_may_go_with_another_workers_last_pair(
-    rig: Path, with_weights: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_folder_of_volumes_may_go(rig: Path, with_weights: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     create, removed = shares.create_alone, []
 
     def created(path: Path) -> int:

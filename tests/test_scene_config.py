@@ -101,9 +101,7 @@ WRITERS: dict[str, Callable[[Path], object]] = {
 
 
 @pytest.mark.parametrize("file", WRITERS)
-def test_heights_are_read_from_a_file_beside_the_rig_and_become_part_of_it(
-    configured: Callable[[str], Config], tmp_path: Path, file: str
-) -> None:
+def test_heights_beside_the_rig_become_its_part(configured: Callable[[str], Config], tmp_path: Path, file: str) -> None:
     (tmp_path / "mould").mkdir()
     WRITERS[file](tmp_path / "mould" / file)
     config = configured(IN_MOULD.replace("FILE", file))
@@ -150,9 +148,7 @@ def test_what_is_no_file_of_heights_is_named(
     assert len(str(refused.value).splitlines()) == 1
 
 
-def test_arrays_that_are_no_heights_and_heights_that_are_given_twice_or_not_are_named(
-    tmp_path: Path, configured: Callable[[str], Config]
-) -> None:
+def test_heights_that_are_none_or_given_twice_are_named(tmp_path: Path, configured: Callable[[str], Config]) -> None:
     for shape, kind in (((4,), "f8"), ((3, 4, 5), "f8"), ((4, 4), "c16"), ((200, 200), "f4")):
         np.save(tmp_path / "a.npy", np.zeros(shape, kind))
         with pytest.raises(InputError, match="expected numbers \\(rows, columns\\)|holds 40000 heights"):
@@ -285,7 +281,7 @@ K1_PER_MM2 = 3e-3
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("column_axis", ["x", "y"])
-def test_a_point_off_the_axis_comes_back_to_its_place(
+def test_a_point_off_the_axis_comes_back(
     table2: Camera, water: Media, rng: np.random.Generator, column_axis: str
 ) -> None:
     lattice = Lattice.regular(0.1, origin=(0.013, -0.021))

@@ -37,9 +37,7 @@ def frames(rng: np.random.Generator) -> tuple[Floats, Floats]:
     return np.concatenate([both + noise[0], lone[0]]), np.concatenate([both + moved(both) + noise[1], lone[1]])
 
 
-def test_particles_are_followed_further_than_their_distance_and_few_without_common_ones(
-    frames: tuple[Floats, Floats], rng: np.random.Generator
-) -> None:
+def test_particles_are_followed_beyond_their_distance(frames: tuple[Floats, Floats], rng: np.random.Generator) -> None:
     tracks = track(*map(Seen, frames), SCALE, 0.6)
     right = (tracks.first == tracks.second) & (tracks.first < 450)
     assert right.sum() > 0.9 * 450
@@ -113,9 +111,7 @@ def test_grid_states_its_error_and_ignores_strays(rng: np.random.Generator) -> N
 
 @pytest.mark.thorough
 @pytest.mark.parametrize(("wavelength_mm", "tracks"), [(4.0, 1500), (8.0, 300), (2.5, 1500)])
-def test_errors_are_stated_whatever_the_density_and_the_flow(
-    wavelength_mm: float, tracks: int, rng: np.random.Generator
-) -> None:
+def test_errors_are_stated_at_any_density(wavelength_mm: float, tracks: int, rng: np.random.Generator) -> None:
     """Vortices seen by many tracks and by few: a component that is all noise, and two that bend."""
     flow = taylor_green(0.1, wavelength_mm, (2.0, 2.0, 2.0), "xy")
     points = rng.uniform(0.0, BOX_MM, (tracks, 3))
@@ -205,9 +201,7 @@ def error_over_sigma(recorded: Recorded, found: Trajectories, frames: int) -> Fl
 
 
 @pytest.mark.thorough
-def test_errors_fall_with_the_number_of_frames_and_tracks_go_on_over_lost_ones(
-    recorded: Recorded, followed: Trajectories
-) -> None:
+def test_errors_fall_with_frames_and_tracks_outlive_lost_ones(recorded: Recorded, followed: Trajectories) -> None:
     pair = track(*recorded.seen[:2], SCALE, 0.4)
     moved = recorded.points[1][pair.second] - recorded.points[0][pair.first]
     middle = 0.5 * (recorded.true_mm[0][pair.first] + recorded.true_mm[1][pair.second])
@@ -246,9 +240,7 @@ def test_ghosts_fall_with_the_length_of_tracks() -> None:
     assert np.mean(lengths_of(crowd.follow(5, 2))[np.concatenate(crowd.true_number[:5]) >= 0] >= 3) > 0.85
 
 
-def test_tracks_are_of_one_particle_each_and_their_own_past_goes_first(
-    recorded: Recorded, followed: Trajectories, rng: np.random.Generator
-) -> None:
+def test_tracks_are_of_one_particle_each(recorded: Recorded, followed: Trajectories, rng: np.random.Generator) -> None:
     labels, truth = np.concatenate(followed.labels), np.concatenate(recorded.true_number)
     order = np.argsort(labels, kind="stable")
     starts = np.searchsorted(labels[order], np.arange(followed.count))
@@ -268,9 +260,7 @@ def test_tracks_are_of_one_particle_each_and_their_own_past_goes_first(
 
 
 @pytest.mark.parametrize("frames", [3, 7])
-def test_parabolas_are_taken_exactly_and_lines_are_lines_and_noise_is_found(
-    frames: int, rng: np.random.Generator
-) -> None:
+def test_parabolas_are_exact_lines_are_lines_and_noise_is_found(frames: int, rng: np.random.Generator) -> None:
     time = np.arange(frames) - 1.0
     start, velocity, bend = rng.normal(0.0, 1.0, (3, 200, 1, 3)) * np.array([5.0, 0.2, 0.02]).reshape(3, 1, 1, 1)
     straight = start + velocity * time[:, np.newaxis]
@@ -313,9 +303,7 @@ def test_velocities_on_circles_are_within_their_errors(rng: np.random.Generator,
 
 
 @pytest.mark.parametrize(("turn_rad", "half_frames"), [(0.0, 3), (0.8, 2)])
-def test_velocities_take_fewer_frames_where_parabolas_do_not_follow(
-    turn_rad: float, half_frames: int, rng: np.random.Generator
-) -> None:
+def test_velocities_take_fewer_frames_in_turns(turn_rad: float, half_frames: int, rng: np.random.Generator) -> None:
     """Particles on circles of 0.05 mm that turn by so much from frame to frame."""
     phase, centre = rng.uniform(0.0, 2.0 * np.pi, 300), rng.uniform(0.0, BOX_MM, (300, 3))
     points = []

@@ -85,9 +85,7 @@ def test_masks_and_walls_leave_windows_out_and_a_mean_needs_pairs(volumes: list[
 
 
 @pytest.mark.thorough
-def test_an_ensemble_is_one_field_and_a_batch_has_a_mean(
-    volumes: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_ensemble_is_one_field(volumes: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run("correlate", *volumes[:4], "--pairing", "ab", "--ensemble", "-o", tmp_path / "together.vtkhdf")
     together = open_vectors(tmp_path / "together.vtkhdf")
     folder, mean = tmp_path / "each", tmp_path / "mean.vtkhdf"
@@ -118,7 +116,7 @@ def warned(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[dict
     return summary, [each["code"] for each in summary["warnings"]]
 
 
-def test_the_summary_says_how_good_the_vectors_are(
+def test_the_summary_says_how_good_it_is(
     volumes: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     summary, codes = warned(capsys, *volumes[:4], "--pairing", "ab", "-o", tmp_path)
@@ -213,8 +211,6 @@ def test_a_lost_frame_costs_its_pair_alone(tmp_path: Path, capsys: pytest.Captur
     assert open_vectors(tmp_path / "listed.vtkhdf").flag.size
 
 
-def test_a_stated_time_that_the_recording_contradicts_is_told(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_stated_time_against_the_recorded_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run("correlate", *moved(tmp_path, times_s=(0.5, 0.504)), "-o", tmp_path / "v.vtkhdf")
     assert "recorded 0.004 s apart, and 0.002 s are stated" in capsys.readouterr().err

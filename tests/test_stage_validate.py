@@ -102,7 +102,7 @@ def vectors(tmp_path: Path) -> Path:
 
 
 @pytest.mark.thorough
-def test_the_truth_is_the_flow_that_the_config_names_or_else_that_of_particles(
+def test_the_truth_is_a_flow_or_that_of_particles(
     vectors: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     pytest.importorskip("matplotlib")

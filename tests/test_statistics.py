@@ -278,9 +278,7 @@ def test_the_stresses_of_turbulence_lie_within_their_errors(rng: np.random.Gener
 
 
 @pytest.mark.thorough
-def test_the_channel_of_the_experiment_has_its_mean_and_no_stress(
-    data_folder: Path, rng: np.random.Generator, tmp_path: Path
-) -> None:
+def test_the_experiment_has_its_mean_no_stress(data_folder: Path, rng: np.random.Generator, tmp_path: Path) -> None:
     text = CONFIG.read_text()
     rig = tmp_path / "rig.yaml"
     rig.write_text(text.replace("shape_xyz: [30, 22, 40]", "shape_xyz: [100, 90, 90]"))

@@ -133,9 +133,7 @@ def test_numbers_grow_with_x_and_y_however_the_board_is_turned_and_markers_are_n
         ),
     ],
 )
-def test_a_target_of_another_kind_is_named(
-    table2: Camera, shown: BoardGeometry, said: BoardGeometry, expected: str
-) -> None:
+def test_another_target_is_named(table2: Camera, shown: BoardGeometry, said: BoardGeometry, expected: str) -> None:
     camera = large(table2) if shown.pattern == "charuco" else small(table2)
     with pytest.raises(InputError, match=expected):
         locate_board(at_one_mm(shown), camera, said, Media())
@@ -248,9 +246,7 @@ def test_quadrants_share_what_a_fine_grid_counts(layout: str) -> None:
     np.testing.assert_allclose(shares[4:], [1.0, 0.0], atol=1e-12)
 
 
-def test_a_white_plate_is_a_white_image_and_rays_to_it_are_those_of_the_tracer(
-    camera: Camera, rng: np.random.Generator
-) -> None:
+def test_a_white_plate_is_a_white_image_by_the_tracer_s_rays(camera: Camera, rng: np.random.Generator) -> None:
     # Where the plate's margin fills the view there is nothing but the aperture.
     camera = small(camera, 90, 90)
     board = BoardGeometry((2, 2), 40.0, 0.0, pattern="chessboard")

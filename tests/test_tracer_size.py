@@ -73,9 +73,7 @@ def test_the_diameter_is_found(
 
 
 @pytest.mark.thorough
-def test_by_waves_diffusion_is_found_beside_the_diameter(
-    table2: Camera, water: Media, rng: np.random.Generator
-) -> None:
+def test_by_waves_diffusion_is_found_too(table2: Camera, water: Media, rng: np.random.Generator) -> None:
     camera = replace(table2, columns=260, rows=240)
     tracers = rng.uniform((-0.5, -0.45, 0.5, 2e5), (0.5, 0.45, 2.0, 6e5), (14, 4))
     image = image_of(camera, water, tracers, 0.6, Light(532e-6, 0.42, DEPTHS_MM))
@@ -90,9 +88,7 @@ def test_by_waves_diffusion_is_found_beside_the_diameter(
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("number", [60, 400])
-def test_crowded_diameters_are_right_or_none(
-    table2: Camera, water: Media, rng: np.random.Generator, number: int
-) -> None:
+def test_crowded_diameters_are_right(table2: Camera, water: Media, rng: np.random.Generator, number: int) -> None:
     # Some .9 and 6 tracers for each microlens.
     camera = replace(table2, columns=260, rows=240)
     tracers = rng.uniform((-0.7, -0.65, 0.5, 3e5), (0.7, 0.65, 2.0, 7e5), (number, 4))
@@ -196,9 +192,7 @@ def test_a_size_that_grows_beyond_all_tracers_is_none(monkeypatch: pytest.Monkey
 
 
 @pytest.mark.parametrize(("count", "enough"), [(40, True), (20, True), (19, False), (10, False), (0, False)])
-def test_a_size_is_that_of_tracers_of_which_half_stand_alone(
-    monkeypatch: pytest.MonkeyPatch, count: int, enough: bool
-) -> None:
+def test_a_size_is_that_of_half_the_tracers(monkeypatch: pytest.MonkeyPatch, count: int, enough: bool) -> None:
     losses = np.square(np.arange(-2.0, 3.0))[:, np.newaxis] * np.ones(40)
     trial = Trial(0.5, losses, np.arange(40) < count)
     monkeypatch.setattr("lfpiv_cli.particles.diameter._found", lambda *_: (SimpleNamespace(view=None), None))

@@ -77,9 +77,7 @@ def test_components_are_in_their_own_voxels_and_slices_between_planes(truth: Flo
     assert of_flow.streamwise_mean_error_at(Measured(field, truth, inside), 0, 0.4) == pytest.approx(0.32 / 0.3 - 1.0)
 
 
-def test_shares_of_streamwise_and_full_vectors_differ_and_meet_the_cumulative_distribution(
-    truth: Floats, inside: Flags, rng: np.random.Generator
-) -> None:
+def test_shares_differ_and_meet_the_distribution(truth: Floats, inside: Flags, rng: np.random.Generator) -> None:
     measured = truth.copy()
     measured[0, ..., 1] *= 1.3
     measured[1, ..., 2] += 0.3 * truth[1, ..., 1]

@@ -129,9 +129,7 @@ def test_green_light_is_that_of_a_plain_quadrature(small: Camera, z: float) -> N
     assert apart(by_waves(camera, point), quadrature(camera, point, GREEN.wavelength_mm, 0.0055 / 9.3, 0.045)) < 0.02
 
 
-def test_main_lens_alone_makes_airys_disc_and_one_lens_in_focus_a_squared_sinc(
-    square: Camera, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_main_lens_makes_airys_disc_and_one_lens_a_sinc(square: Camera, monkeypatch: pytest.MonkeyPatch) -> None:
     # On a sensor right behind an array without power: (2 J1(v) / v)², v = k R r / s_i.
     monkeypatch.setattr(waves, "MARGIN_PITCHES", 3.0)
     bare = replace(
@@ -367,9 +365,7 @@ def picture(near_camera: Camera) -> tuple[Floats, Singles]:
     return seen, render_white(near_camera, 1.0, waves=light).astype(np.float32)
 
 
-def test_a_dot_by_waves_lies_where_it_is(
-    near_camera: Camera, shapes: WaveShapes, picture: tuple[Floats, Singles]
-) -> None:
+def test_a_dot_by_waves_is_in_place(near_camera: Camera, shapes: WaveShapes, picture: tuple[Floats, Singles]) -> None:
     """By rays it does not: near focus its light comes through few lenses, of which some are lit in part."""
     look, start = DotLook(*picture, Media(), RADIUS, PLACE[np.newaxis, :2], PLACE[2]), PLACE + (0.004, -0.004, 0.02)
     by_rays, by_waves = (look.fitted(start, near_camera, BOARD, disc_shape(RADIUS), light) for light in (None, shapes))
@@ -381,9 +377,7 @@ def test_a_dot_by_waves_lies_where_it_is(
     assert by_waves.brightness == pytest.approx(1.0, abs=0.02)
 
 
-def test_a_disc_that_fills_the_scene_is_uniform_light_and_hexagons_are_refused(
-    near_camera: Camera, shapes: WaveShapes
-) -> None:
+def test_a_disc_that_fills_the_scene_is_uniform_light(near_camera: Camera, shapes: WaveShapes) -> None:
     # Its share is 1 of every pixel, whatever the depth: what reaches a pixel comes from within a few lenses.
     dark = np.zeros((near_camera.rows, near_camera.columns))
     near = pixels_near((dark, dark.astype(np.float32) + 1.0), near_camera, Media(), PLACE, 0.2, 10_000)

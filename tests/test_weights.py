@@ -87,7 +87,7 @@ def test_kernels_equal_dense_products(small, water, rng, shape):
     np.testing.assert_allclose(operator.adjoint(image), adjoint_reference(operator, image), rtol=1e-5, atol=1e-6)
 
 
-def test_operators_give_the_same_bits_for_any_number_of_threads_and_columns_keep_their_light(
+def test_bits_do_not_depend_on_threads_nor_light(
     small: Camera, water: Media, rng: np.random.Generator, one_thread
 ) -> None:
     operator = factorise(small, water, Grid.centred((9, 8, 7), (0.1, 0.1, 0.5), (0.0, 0.0, 0.0)))
