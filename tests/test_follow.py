@@ -160,12 +160,12 @@ def test_what_is_there_is_replaced_when_asked(rig: Path, followed: Path) -> None
     assert bytes_of(followed) == before
 
 
-def test_two_frames_or_a_share_are_refused(rig: Path, tmp_path: Path) -> None:
+def test_two_frames_or_a_share_are_refused(weights: Path, images: list[Path], tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=r"3 frames at least, got 2; for a pair: .*track"):
-        follow(rig, tmp_path / "run", frames=images(rig)[:2])
+        run("follow", weights, *images[:2], "-o", tmp_path / "run")
     assert not (tmp_path / "run").exists()
     with pytest.raises(UsageError, match="3 frames"):
-        lf.follow(lf.open_weights(rig / "weights.h5"), [lf.read_image(path) for path in images(rig)[:2]])
+        lf.follow(lf.open_weights(weights), [lf.read_image(path) for path in images[:2]])
     with pytest.raises(UsageError, match="cannot be divided"):
         run("follow", tmp_path / "weights.h5", tmp_path / "a.tif", "--shard", "1/2", "-o", tmp_path / "run")
 
