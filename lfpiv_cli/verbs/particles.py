@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -454,7 +455,7 @@ class Prepared:
         InputError : as `open_weights`
         OutputError : there is too little memory for them
         """
-        status = path.stat() if path.exists() else None
+        status = path.stat() if os.path.exists(path) else None
         return self._opened(path, status and status.st_size, status and status.st_mtime_ns)
 
     def searchable(self, path: Path, settings: Config) -> WeightsFile:
