@@ -13,7 +13,6 @@ from lfpiv_cli.flow.correlation import correlate, count_passes
 from lfpiv_cli.flow.deformation import SLACK, SPLINE_PAD, deform_pair, spline_coefficients, spline_matrix
 from lfpiv_cli.flow.field import MASKED, REJECTED, VectorField
 from lfpiv_cli.flow.peaks import find_peaks, vertex
-from lfpiv_cli.flow.sums import map_sums, margins
 from lfpiv_cli.flow.windows import CorrelationSettings, layout_windows
 from lfpiv_cli.grid import Grid
 
@@ -88,36 +87,6 @@ def test_windows_are_centred_in_the_volume(voxels: int, size: int, overlap: floa
     assert layout.count[0] == max(1, voxels // layout.step[0])
     # Windows start on whole voxels: an odd remainder shifts them by half a voxel.
     assert abs(0.5 * (centres[0] + centres[-1]) - 0.5 * (voxels - 1)) <= 0.5
-
-
-@pytest.mark.parametrize(("size", "overlap"), [((8, 8, 8), HALF), ((8, 7, 6), (0.75, 0.5, 0.0)), ((16, 12, 8), HALF)])
-def test_maps_are_the_symmetric_normalised_correlation(
-    size: tuple[int, int, int], overlap: tuple[float, float, float], rng: np.random.Generator
-) -> None:
-    a, b = rng.random((2, 18, 20, 22)).astype(np.float32)
-    layout = layout_windows((22, 20, 18), size, overlap)
-    before, after = margins(layout, a.shape, 2)
-    margin = list(zip(before, after, strict=True))
-    padded_a, padded_b = np.pad(a, margin), np.pad(b, margin)
-    maps = map_sums(padded_a, padded_b, layout, before, 2).correlation()
-
-    def window(volume: Singles, index: tuple[int, ...], shift: tuple[int, ...]) -> Floats:
-        start = [
-            layout.first[xyz] + k * layout.step[xyz] + s + m
-            for xyz, k, s, m in zip((2, 1, 0), index, shift, before, strict=True)
-        ]
-        slices = tuple(slice(s, s + layout.size[xyz]) for s, xyz in zip(start, (2, 1, 0), strict=True))
-        return volume[slices].astype(np.float64)
-
-    last = tuple(n - 1 for n in layout.count[::-1])
-    for index, shift in (((0, 0, 0), (1, -2, 2)), (last, (2, 0, -1)), ((1, 0, 1), (0, 0, 0))):
-        back = tuple(-s for s in shift)
-        here_a, here_b = window(padded_a, index, (0, 0, 0)), window(padded_b, index, (0, 0, 0))
-        moved_a, moved_b = window(padded_a, index, back), window(padded_b, index, shift)
-        energy_a, energy_b = np.sum(here_a**2) + np.sum(moved_a**2), np.sum(here_b**2) + np.sum(moved_b**2)
-        expected = (np.sum(here_a * moved_b) + np.sum(moved_a * here_b)) / np.sqrt(energy_a * energy_b)
-        # The products are summed in float32 over at most 16 planes.
-        assert maps[index][tuple(s + 2 for s in shift)] == pytest.approx(expected, abs=1e-6)
 
 
 def test_peaks_of_gaussians_are_exact_and_second_ones_are_maxima_of_their_own() -> None:

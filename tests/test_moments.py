@@ -1,5 +1,7 @@
 """Gauss-Newton steps: against least squares voxel by voxel, on elongated particles, and their uncertainty."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter, shift
@@ -9,6 +11,8 @@ from lfpiv_cli.arrays import Floats, Singles
 from lfpiv_cli.flow.moments import gauss_newton, pair_moments
 from lfpiv_cli.flow.sums import margins
 from lfpiv_cli.flow.windows import WindowLayout, cells_of, layout_windows
+from lfpiv_cli.names import Weighting, names_in
+from tests.test_windows import weights_in
 
 HALF = (0.5, 0.5, 0.5)
 SHAPE = (32, 40, 36)
@@ -29,12 +33,13 @@ def shifted(
     return volume_pair(lambda points: np.tile(moved, (len(points), 1)), SHAPE, Seeding(12.0, sigma, noise), rng)
 
 
+@pytest.mark.parametrize("weighting", names_in(Weighting))
 @pytest.mark.parametrize(("size", "overlap"), [((16, 16, 16), HALF), ((12, 16, 9), (0.5, 0.25, 0.3))])
 def test_one_window_is_the_least_squares_solution_over_its_voxels(
-    size: tuple[int, int, int], overlap: tuple[float, float, float], rng: np.random.Generator
+    size: tuple[int, int, int], overlap: tuple[float, float, float], weighting: Weighting, rng: np.random.Generator
 ) -> None:
     a, b = shifted(rng, (1.2, 1.2, 2.0))
-    layout = layout_windows(SHAPE, size, overlap)
+    layout = replace(layout_windows(SHAPE, size, overlap), weighting=weighting)
     found, _ = steps(a, b, layout)
     mean = 0.5 * (a.astype(float) + b)
     window = tuple(
@@ -42,7 +47,9 @@ def test_one_window_is_the_least_squares_solution_over_its_voxels(
     )
     gradient = [g[window].ravel() for g in np.gradient(mean)][::-1]
     basis = np.stack([*gradient, mean[window].ravel()], axis=1)
-    expected = -np.linalg.lstsq(basis, (b.astype(float) - a)[window].ravel(), rcond=None)[0][:3]
+    root = np.sqrt(weights_in(layout)).ravel()
+    right = root * (b.astype(float) - a)[window].ravel()
+    expected = -np.linalg.lstsq(root[:, np.newaxis] * basis, right, rcond=None)[0][:3]
     np.testing.assert_allclose(found[1, 1, 1], expected, atol=1e-4)
 
 
