@@ -321,6 +321,7 @@ def test_both_weights_give_one_volume_and_momentum_catches_up(operator, rng: np.
     assert figures["plain_s"] > 0.0
 
 
+@pytest.mark.thorough
 def test_every_way_has_a_rate(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(timing, "PAUSE_S", 0.0)
     monkeypatch.setattr(timing, "LEAST_S", 0.0)

@@ -424,6 +424,7 @@ def test_a_region_without_tracers_has_no_vectors(rng: np.random.Generator) -> No
     assert np.mean(field.flag[:, :, x < 20.0] != REJECTED) > 0.5
 
 
+@pytest.mark.thorough
 def test_tails_of_long_particles_are_no_vectors(rng: np.random.Generator) -> None:
     """Particles of 8 voxels standard deviation in the middle third of the depth: what lies beyond is their light."""
     shape, sigma = (64, 64, 144), 8.0

@@ -167,6 +167,7 @@ def test_strips_are_adjoint_and_light_what_columns_say(table2, water, rng, colum
     assert operator.misfit_l1.max() == pytest.approx(np.max(errors), abs=0.008)  # what it says of itself
 
 
+@pytest.mark.thorough
 def test_strips_are_the_sum_of_their_columns(beside, rng, one_thread):
     _, operator = beside
     volume, image = rng.random(operator.shape, np.float32), rng.random(operator.image_shape, np.float32)
@@ -278,6 +279,7 @@ def test_voxels_outside_the_fluid_stay_dark(table2, tube, rng):
         assert found.volume[inside].any()
 
 
+@pytest.mark.thorough
 def test_what_does_not_separate_is_made_on_demand(table2, tube, water):
     grid = Grid.centred((2, 2, 2), VOXEL, (0.1, 0.2, 0.3))
     turned = replace(table2, lattice=Lattice.regular(0.1, "hexagonal"))
@@ -287,6 +289,7 @@ def test_what_does_not_separate_is_made_on_demand(table2, tube, water):
     assert isinstance(operator_of(table2, tube_of(water, (1.0, 1.0, 0.0)), oblique), OnDemandOperator)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("operator_kind", ["strips", "on demand"])
 def test_a_weights_file_holds_them(beside, tube, tmp_path, operator_kind):
     camera, operator = beside
@@ -310,6 +313,7 @@ def test_a_weights_file_holds_them(beside, tube, tmp_path, operator_kind):
     assert (notice.code, notice.measured) == ("weights-inexact", 0.05)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("group", "name", "value"),
     [
@@ -355,6 +359,7 @@ def test_a_weights_file_holds_every_kind_of_face(table2, water, tmp_path, surfac
     assert open_weights(path).weights.solver_operator.source == space
 
 
+@pytest.mark.thorough
 def test_transmission_scales_pixels_of_turned_strips(table2, water, rng):
     camera = replace(table2, columns=1768, rows=300)
     grid = Grid.centred((20, 4, 3), (0.1, 0.1, 1.0), (2.6, 0.1, 0.0))

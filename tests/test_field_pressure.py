@@ -133,6 +133,7 @@ def test_gradients_of_splines_are_their_differences(rng):
         np.testing.assert_allclose(found[:, axis], slope, atol=1e-6)
 
 
+@pytest.mark.thorough
 def test_poisson_a_fit_has_the_pressure_whose_gradient_accelerates_the_fluid(rng):
     """grad p = -rho a, of p = 3 (x^2 - y z) Pa per mm^2, which cubic splines hold exactly."""
     points = rng.uniform(0.0, (3.0, 2.0, 2.0), (400, 3))
@@ -149,6 +150,7 @@ def test_poisson_a_fit_has_the_pressure_whose_gradient_accelerates_the_fluid(rng
     np.testing.assert_allclose(pressure.gradient_at(points, BOX, field.coefficients), slope, atol=1e-5)
 
 
+@pytest.mark.thorough
 def test_what_is_no_gradient_falls_away_and_is_seen_in_chi_squared(rng):
     """A curl that does not pass the faces has no part that is a gradient."""
     points = rng.uniform(0.0, (3.0, 2.0, 2.0), (400, 3))

@@ -183,6 +183,7 @@ def test_noise_of_dark_pixels_holds_the_haze_s_shot_noise():
     assert noise.of_dark(np.array([1000.0, 2000.0])) == pytest.approx(np.sqrt(36.0 + 2.0 * 1500.0))
 
 
+@pytest.mark.thorough
 def test_reconstruct_takes_haze_off_and_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     rig = sample_rig(tmp_path, AT_FOCUS, ("shape_xyz: [30, 22, 40]", "shape_xyz: [8, 6, 12]"))
     pictures = {name: read_image(SAMPLE / f"{name}.tif").astype(np.float64) for name in ("white", "dark", "pair_a")}
