@@ -16,7 +16,6 @@ from lfpiv_cli import correlate
 from lfpiv_cli.arrays import Singles
 from lfpiv_cli.calibration.model import Calibration, Channel
 from lfpiv_cli.cli.main import cli
-from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.files.config import Config
 from lfpiv_cli.files.images import write_tiff
 from lfpiv_cli.files.rig_numbers import RigNumbers, rig_text, tree_of
@@ -79,10 +78,6 @@ BAD_RIGS = {
     "a long time between images": (changed(PLAIN, correlation__dt_s=0.1), "time step", "no"),
     "voxels too wide": (changed(PLAIN, volume={"shape_xyz": [40, 40, 50], "voxel_mm": [0.2] * 3}), "voxels", "no"),
     "windows too large": (changed(PLAIN, correlation__window_mm=20.0), "windows", "no"),
-}
-REFUSED = {
-    "sign of the magnification": (changed(PLAIN, camera__main_lens__magnification=1.0), "magnification"),
-    "pixels in millimetres": (changed(PLAIN, camera__sensor__pixel_um=0.0055), "pixel_um"),
 }
 
 
@@ -152,12 +147,6 @@ def test_bad_rigs_are_told(tree: Tree, about: str, verdict: str) -> None:
     lines = rig_lines(bench_of(settings_of(tree), None))
     assert verdicts(lines)[about] == verdict
     assert worst(lines) in ("look", "no")
-
-
-@pytest.mark.parametrize(("tree", "key"), REFUSED.values(), ids=REFUSED)
-def test_what_cannot_be_is_refused_by_its_key(tree: Tree, key: str) -> None:
-    with pytest.raises(ConfigError, match=key):
-        settings_of(tree)
 
 
 # Volume and windows in voxels of 0.1 mm: the shipped sample's, and others that cells do not fill.
