@@ -69,7 +69,7 @@ def fitted_by(
     return fit
 
 
-@pytest.mark.parametrize("no_slip", [True, False])
+@pytest.mark.parametrize("no_slip", [True, pytest.param(False, marks=pytest.mark.thorough)])
 def test_the_fluid_stands_still_at_a_pipes_wall(rng: np.random.Generator, no_slip: bool) -> None:
     wall, flow, dt_s = RoundWall(1.0, axis="x"), pipe(1.0, 0.05), 2e-3
     # few tracks, and none near the wall
@@ -154,7 +154,7 @@ def test_measurements_of_one_flow_need_the_same_coordinates_alone(
     section: str, key: str, value: Any, found: str | None, tmp_path: Path, rng: np.random.Generator
 ) -> None:
     changes = {"a": {}, "b": {section: {key: value}}}
-    paths = [write_tracks(tmp_path / f"{name}.vtkhdf", rng, changes=each) for name, each in changes.items()]
+    paths = [write_tracks(tmp_path / f"{name}.vtkhdf", rng, 20, changes=each) for name, each in changes.items()]
     with nullcontext() if found is None else pytest.raises(InputError, match=found):
         fit_flow(paths, tmp_path / "field.vtkhdf", console=Console(quiet=True))
 

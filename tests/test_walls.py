@@ -256,6 +256,7 @@ def refined(scene: MovableScene, rng: np.random.Generator, images: Floats) -> Sc
     )
 
 
+@pytest.mark.thorough
 def test_what_is_told_and_shown_of_a_scene(scene: MovableScene, rng: np.random.Generator) -> None:
     found = refined(scene, rng, TRUTH)
     assert found.agree
@@ -290,6 +291,7 @@ def test_what_is_told_and_shown_of_a_scene(scene: MovableScene, rng: np.random.G
     assert counted.get_xlim()[0] < found.wall.radius_mm < counted.get_xlim()[1]
 
 
+@pytest.mark.thorough
 def test_what_contradicts_the_scene_is_told_with_both_figures(scene: MovableScene, rng: np.random.Generator) -> None:
     """Wall and images of one place and radius are quiet; of another radius or place they are not, nor as certain."""
     right = together(refined(scene, rng, TRUTH))

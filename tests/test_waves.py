@@ -365,6 +365,7 @@ def picture(near_camera: Camera) -> tuple[Floats, Singles]:
     return seen, render_white(near_camera, 1.0, waves=light).astype(np.float32)
 
 
+@pytest.mark.thorough
 def test_a_dot_by_waves_is_in_place(near_camera: Camera, shapes: WaveShapes, picture: tuple[Floats, Singles]) -> None:
     """By rays it does not: near focus its light comes through few lenses, of which some are lit in part."""
     look, start = DotLook(*picture, Media(), RADIUS, PLACE[np.newaxis, :2], PLACE[2]), PLACE + (0.004, -0.004, 0.02)
