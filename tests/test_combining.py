@@ -13,6 +13,7 @@ from lfpiv_cli.files import vtkhdf
 from lfpiv_cli.flow.combining import combine
 from lfpiv_cli.flow.field import MASKED, REJECTED, REPLACED, SECOND_PEAK, VALID, VectorField
 from lfpiv_cli.grid import Grid, Reference
+from tests.vector_fields import field_on
 
 GRID = Grid((10, 11, 12), (0.8, 0.8, 0.8), (-3.6, -4.0, -4.4))
 SHAPE = GRID.shape_zyx
@@ -20,14 +21,12 @@ SHAPE = GRID.shape_zyx
 
 def truth() -> Floats:
     """A shear in depth, voxels."""
-    z, y, x = np.meshgrid(*(GRID.axis_mm(axis) for axis in (2, 1, 0)), indexing="ij")
+    x, y, z = np.moveaxis(GRID.centres_mm(), -1, 0)
     return np.stack([2.0 + 0.5 * z, 0.3 * x, 0.2 * y], axis=-1)
 
 
 def field_of(values: Floats, sigma: Floats) -> VectorField:
-    ones = np.ones(SHAPE)
-    flag = np.full(SHAPE, VALID, dtype=np.uint8)
-    return VectorField(GRID, values, values, ones, ones, ones, flag, sigma, (0.1,) * 3, 0.002, (16, 16, 16))
+    return field_on(GRID, values, sigma_voxel=sigma, dt_s=0.002)
 
 
 @pytest.fixture

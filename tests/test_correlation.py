@@ -54,8 +54,7 @@ def moving_pair(
 
 
 def truth_at(field: VectorField, flow: Flow) -> Floats:
-    z, y, x = np.meshgrid(*(field.grid.axis_mm(axis) for axis in (2, 1, 0)), indexing="ij")
-    points = np.stack([x, y, z], axis=-1)
+    points = field.grid.centres_mm()
     return flow(points.reshape(-1, 3)).reshape(points.shape)
 
 

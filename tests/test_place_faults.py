@@ -222,14 +222,11 @@ HARM: dict[str, Callable[[], bytes]] = {
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("harm", HARM)
-def test_what_is_no_list_of_particles_is_refused(tmp_path: Path, harm: str) -> None:
-    vectors, particles = tmp_path / "v.vtkhdf", tmp_path / "true.npz"
-    field = field_of(np.random.default_rng(1).normal(size=(*SHAPE, 3)), None)
-    write_vectors(vectors, field, FOCAL_POINT, provenance={}, overwrite=False)
+def test_what_is_no_list_of_particles_is_refused(tmp_path: Path, vectors: Path, harm: str) -> None:
+    particles = tmp_path / "true.npz"
     particles.write_bytes(HARM[harm]())
-    code, said = ended(
-        "validate", "flow", CONFIG, "--vectors", vectors, "--particles", particles, "-o", tmp_path / "report"
-    )
+    given = ("--vectors", vectors, "--particles", particles)
+    code, said = ended("validate", "flow", CONFIG, *given, "-o", tmp_path / "report")
     assert code == 4
     assert f"{particles}: " in said
     json.dumps(said)
