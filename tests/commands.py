@@ -34,13 +34,18 @@ def told(capsys: pytest.CaptureFixture[str], *arguments: object) -> dict[str, An
     return dict(json.loads(out))
 
 
-def sample_rig(folder: Path, *changes: tuple[str, str]) -> Path:
-    """Write the sample's config with pieces of its text replaced, each of which must be there."""
-    text = CONFIG.read_text()
+def changed(name: str, *changes: tuple[str, str]) -> str:
+    """Return the text of a shipped config with pieces of it replaced, each of which must be there."""
+    text = (ROOT / "configs" / f"{name}.yaml").read_text()
     for old, new in changes:
         assert old in text, old
         text = text.replace(old, new)
-    (folder / "rig.yaml").write_text(text)
+    return text
+
+
+def sample_rig(folder: Path, *changes: tuple[str, str]) -> Path:
+    """Write the sample's config with such changes."""
+    (folder / "rig.yaml").write_text(changed("sample", *changes))
     return folder / "rig.yaml"
 
 

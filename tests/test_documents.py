@@ -33,7 +33,7 @@ from lfpiv_cli.files.export_vtk import PLAYBACK_FORMAT, PLAYBACK_VERSION, SERIES
 from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, TRACKS_FORMAT, TRAJECTORIES_FORMAT, read_points
 from lfpiv_cli.files.vtkhdf import VECTORS_FORMAT, VOLUME_FORMAT
 from tests import camera_files
-from tests.commands import ROOT, SAMPLE
+from tests.commands import ROOT, SAMPLE, changed
 
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
 MAKEFILE = (ROOT / "Makefile").read_text()
@@ -197,15 +197,6 @@ def run(command: str) -> None:
         return
     with contextlib.suppress(LimitMissedError):
         cli.main([*arguments, "--quiet"], standalone_mode=False)
-
-
-def changed(name: str, *changes: tuple[str, str]) -> str:
-    """Return the text of a shipped config with pieces of it replaced, each of which must be there."""
-    text = (ROOT / "configs" / f"{name}.yaml").read_text()
-    for old, new in changes:
-        assert old in text, old
-        text = text.replace(old, new)
-    return text
 
 
 def write_images(folder: Path) -> None:

@@ -21,9 +21,8 @@ from lfpiv_cli.validation.board import DEPTH_DEFINITIONS, board_figures, elongat
 from lfpiv_cli.validation.flow import limits_missed
 from lfpiv_cli.validation.volume import known_volume, match, normalised_correlation, particle_figures, volume_figures
 from lfpiv_cli.validation.weights import GREY_LEVELS, WINDOW_RADIUS_PX, Column, make_columns, ssim, weights_figures
-from tests.commands import CONFIG, ROOT, run, table2_rig
+from tests.commands import CONFIG, changed, run, table2_rig
 
-TABLE2 = ROOT / "configs" / "table2.yaml"
 BOARD_GRID = Grid.centred((30, 20, 60), (0.1, 0.1, 0.1), (0.0, 0.0, 0.0))
 DOTS = np.array([(x, y) for y in (-0.5, 0.5) for x in (-1.0, 0.0, 1.0)])
 
@@ -79,7 +78,7 @@ def test_boards_without_light_and_volumes_too_thin_for_them_are_refused(tmp_path
     with pytest.raises(InputError, match="no light"):
         measure_dots(np.zeros(BOARD_GRID.shape_zyx, np.float32), BOARD_GRID, DOTS, 0.5)
     thin = tmp_path / "thin.yaml"
-    thin.write_text(TABLE2.read_text().replace("shape_xyz: [80, 80, 240]", "shape_xyz: [80, 80, 18]"))
+    thin.write_text(changed("table2", ("shape_xyz: [80, 80, 240]", "shape_xyz: [80, 80, 18]")))
     with pytest.raises(ConfigError, match="holds 1 of the boards"):
         run("validate", "board", thin, "-o", tmp_path / "report")
 
@@ -91,12 +90,8 @@ def test_validate_board_on_a_small_camera(tmp_path: Path) -> None:
     changes |= {"solver": "sart/em", "iterations": "200/8", "rotation_deg": "0.0   /0.4   "}
     changes |= {"shift_px": "[0.0, 0.0]  /[5.0, -4.0]  ", "images": "ideal/both"}
     changes |= {"methods": "[ert, dlfc]/[ert, dlfc, discs]"}
-    text = TABLE2.read_text()
-    for key, values in changes.items():
-        old, new = (f"{key}: {value}" for value in values.split("/"))
-        assert old in text, old
-        text = text.replace(old, new)
-    (tmp_path / "small.yaml").write_text(text)
+    pairs = (tuple(f"{key}: {value}" for value in values.split("/")) for key, values in changes.items())
+    (tmp_path / "small.yaml").write_text(changed("table2", *pairs))
     run("validate", "board", tmp_path / "small.yaml", "-o", tmp_path / "report")
     report = json.loads((tmp_path / "report" / "board.json").read_text())["figures"]
     for half, method in product(("ideal", "recorded"), ("ert", "dlfc")):
