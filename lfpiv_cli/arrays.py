@@ -13,6 +13,8 @@ Floats: TypeAlias = NDArray[np.float64]
 Singles: TypeAlias = NDArray[np.float32]
 Integers: TypeAlias = NDArray[np.int64]
 Flags: TypeAlias = NDArray[np.bool_]
+# A number in either precision.
+Real: TypeAlias = float | np.floating[Any]
 
 
 def root_of_squares(values: NDArray[Any]) -> float:

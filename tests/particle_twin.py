@@ -121,7 +121,7 @@ def _profile(view: View, along: Along, bent: tuple[float, float], s: float, out:
         out[:, k] = 0.0
         out[PATCH, k] = middle
         for node in range(3):
-            xi = (node - 1) * GAUSS_AT
+            xi = GAUSS_AT[node]
             # X of the node, its derivatives, and those of u, the array point relative to the lens.
             place = middle + 0.5 * abs(width) * xi
             place_x, place_z = lever * beta / scale, lever * slope * (x - place) / scale

@@ -164,10 +164,10 @@ def test_hexagonal_cells_share_out_all_light() -> None:
 ALL_PLACES = [(0.31, -0.2, 3.0), (0.53, 0.21, 0.02), (-0.063, 0.07, 0.2), (0.2, 0.3, -4.0), (1.08, 0.2, 1.0)]
 
 
-@pytest.fixture(scope="module", params=["square", "hexagonal", "behind a wall"])
+@pytest.fixture(scope="module", params=["square", "turned", "hexagonal", "behind a wall"])
 def any_view(table2: Camera, water: Media, request: pytest.FixtureRequest) -> View:
     layout = "hexagonal" if request.param == "hexagonal" else "square"
-    lattice = Lattice.regular(0.1, layout, np.deg2rad(0.12), (0.013, -0.02))
+    lattice = Lattice.regular(0.1, layout, np.deg2rad(0.0 if request.param == "square" else 0.12), (0.013, -0.02))
     camera = replace(table2, lattice=lattice, columns=400, rows=360, distortion_per_mm2=2e-4)
     wall = Window(camera.focus_distance_mm - 60.0, 5.0)
     space = ObjectSpace(water, wall, "exact") if request.param == "behind a wall" else None
@@ -188,12 +188,22 @@ def test_rows_are_the_pixels_one_by_one(any_view: View, place: tuple[float, floa
     np.add.at(images[0], named, found[: named.size])
     np.add.at(images[1], pixels[:count], values[:count])
     largest = np.abs(images[1]).max(axis=0)
-    np.testing.assert_allclose(images[0] / largest, images[1] / largest, atol=1e-11)
+    # Rows are in single precision. Lenses of a turned array share profiles: those that are not in line at second order,
+    # all of a thousandth of the light, and none of where a ball's edge begins to be seen.
+    shared = any_view.cell_table.size == 0 and bool(np.ptp(any_view.centres_mm[:, 0, 0]) > 0.0)
+    within = np.array([3e-4, 0.02, 0.02, 0.02]) if shared else np.full(4, 1e-4)
+    assert np.all(np.abs(images[0] - images[1]).sum(axis=0) < within * np.abs(images[1]).sum(axis=0))
+    lit = images[1][:, 0] > 0.0
+    columns = np.column_stack([images[1][lit, 1:], images[1][lit, 0]])
+    bias = np.linalg.lstsq(columns, (images[0] - images[1])[lit, 0], rcond=None)[0]
+    # A fit would move by this: a hundredth of what it does where all is known but light's own noise.
+    assert np.abs(bias[:2]).max() < 1e-5
+    assert abs(bias[2]) < 2e-4
     # In chi-squared light is squared: each pixel has all of it in one entry.
     # What rounding leaves beside the ball is none.
-    least = 1e-15 * largest[0]
+    least = 1e-6 * largest[0]
     lit = found[: named.size, 0] > least
-    assert np.unique(named[lit]).size == np.count_nonzero(lit) == np.count_nonzero(images[1][:, 0] > least)
+    assert np.unique(named[lit]).size == np.count_nonzero(lit)
 
 
 def test_weights_of_pixels_are_those_of_the_noise(rng: np.random.Generator) -> None:

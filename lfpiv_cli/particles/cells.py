@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from lfpiv_cli.arrays import Floats
+from lfpiv_cli.arrays import Floats, Real
 from lfpiv_cli.optics.camera import Lattice
 from lfpiv_cli.threads import COUNT_NO_REFERENCES
 from lfpiv_cli.weights.lens_cells import neighbours
@@ -28,15 +28,17 @@ from lfpiv_cli.weights.lens_cells import neighbours
 
 
 # The rim is straight across a patch but for its sagitta, taken as its mean: the share is right to 6e-3 where the rim
-# enters a patch by its corner, to 1e-3 on average. An edge that runs along a patch's side is taken to lean by so much.
-# Less than the least share is none, by no rounding some.
-LEAST_LEAN, LEAST_SHARE = 1e-3, 1e-9
+# enters a patch by its corner, to 1e-3 on average. An edge that runs along a patch's side is taken to lean by so much,
+# as much as single precision can tell from none. Less than the least share is none, by no rounding some.
+LEAST_LEAN, LEAST_SHARE = np.float32(1e-2), np.float32(1e-6)
 # Of lengths that divide, mm.
-TINY = 1e-12
+TINY = np.float32(1e-12)
+# In single precision, as what they meet may be: a plain number is in double, and all that follows from it.
+ZERO, QUARTER, HALF, ONE, TWO, THREE, FOUR, SIX = np.array([0.0, 0.25, 0.5, 1.0, 2.0, 3.0, 4.0, 6.0], np.float32)
 
 
 @njit(cache=True, fastmath=True, error_model="numpy", inline="always", **COUNT_NO_REFERENCES)
-def covered_share(x: float, y: float, width: float, radius: float) -> tuple[float, float, float, float, float]:
+def covered_share(x: Real, y: Real, width: Real, radius: Real) -> tuple[Real, Real, Real, Real, Real]:
     """Return C, the means of xi and eta, and the slopes of C along X and Y (per mm) of the patch centred at (x, y).
 
     Means are per whole patch, not per covered part. A point of a square of half its width h is inside where
@@ -44,25 +46,25 @@ def covered_share(x: float, y: float, width: float, radius: float) -> tuple[floa
     difference of max(t +- a +- b, 0)^n / n!, C = d_2/(4 a b), its derivative by t d_1/(4 a b), and integrals by parts
     give the means.
     """
-    half = 0.5 * width
+    half = HALF * width
     away = max(np.sqrt(x * x + y * y), TINY)
     to_x, to_y = abs(x) / away, abs(y) / away
     a, b = half * max(to_x, LEAST_LEAN), half * max(to_y, LEAST_LEAN)
-    t = min(max(radius - away - half * half / (6.0 * radius), -(a + b)), a + b)
-    p, q = t + a + b, max(t + a - b, 0.0)
-    r, s = max(t - a + b, 0.0), max(t - a - b, 0.0)
-    p2, q2, r2, s2 = 0.5 * p * p, 0.5 * q * q, 0.5 * r * r, 0.5 * s * s
-    per = 0.25 / (a * b)
-    per_a, per_b = 4.0 * b * per, 4.0 * a * per
-    per = per if per * (p2 - q2 - r2 + s2) > LEAST_SHARE else 0.0
+    t = min(max(radius - away - half * half / (SIX * radius), -(a + b)), a + b)
+    p, q = t + a + b, max(t + a - b, ZERO)
+    r, s = max(t - a + b, ZERO), max(t - a - b, ZERO)
+    p2, q2, r2, s2 = HALF * p * p, HALF * q * q, HALF * r * r, HALF * s * s
+    per = QUARTER / (a * b)
+    per_a, per_b = FOUR * b * per, FOUR * a * per
+    per = per if per * (p2 - q2 - r2 + s2) > LEAST_SHARE else ZERO
     share, dense = per * (p2 - q2 - r2 + s2), per * (p - q - r + s)
-    third = (p * p2 - q * q2 - r * r2 + s * s2) / 3.0
+    third = (p * p2 - q * q2 - r * r2 + s * s2) / THREE
     mean_x = per * (per_a * third - (p2 - q2 + r2 - s2))
     mean_y = per * (per_b * third - (p2 + q2 - r2 - s2))
     by_a, by_b = per * (p - q + r - s) - per_a * share, per * (p + q - r - s) - per_b * share
     turning = (by_a * to_y - by_b * to_x) * half / away
     slope_x, slope_y = turning * to_y - dense * to_x, -turning * to_x - dense * to_y
-    right, above = -1.0 if x < 0.0 else 1.0, -1.0 if y < 0.0 else 1.0
+    right, above = -ONE if x < ZERO else ONE, -ONE if y < ZERO else ONE
     return share, right * mean_x, above * mean_y, right * slope_x, above * slope_y
 
 

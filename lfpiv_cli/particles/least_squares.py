@@ -24,7 +24,7 @@ from numba.core.typing.templates import Signature
 from numba.core.typing.typeof import typeof_impl
 from numpy.typing import NDArray
 
-from lfpiv_cli.arrays import Floats
+from lfpiv_cli.arrays import Floats, Singles
 from lfpiv_cli.particles.line_light import VALUES, respond_by_lines
 from lfpiv_cli.particles.refraction import bend_of
 from lfpiv_cli.particles.rows import SLACK, Scratch, respond_rows, scratch
@@ -56,12 +56,12 @@ class Responses(NamedTuple):
         find common pixels
     common : (2, 4, capacity) where there are two particles, room for what both do to common pixels
     picked : (2, capacity), room for the residual and the weights of the pixels of one of them
-    scratch : room for what one lens shows
+    scratch : room for what lenses show
     """
 
     counts: NDArray[np.int64]
     pixels: NDArray[np.int32]
-    values: Floats
+    values: Singles
     place: NDArray[np.int32]
     common: Floats
     picked: Floats
@@ -127,7 +127,7 @@ class Effort(NamedTuple):
 def room_for(members: int, capacity: int, places: int) -> Responses:
     """Return room for the responses of so many particles."""
     room = capacity + SLACK
-    pixels, values = np.empty((members, room), np.int32), np.empty((members, VALUES, room))
+    pixels, values = np.empty((members, room), np.int32), np.empty((members, VALUES, room), np.float32)
     common = np.empty((2, UNKNOWNS, room if members == 2 else 0))
     place, picked = np.zeros(places, np.int32), np.empty((2, room))
     return Responses(np.zeros(members, np.int64), pixels, values, place, common, picked, scratch(capacity))
@@ -142,7 +142,7 @@ def copy_rows(source: Floats, target: Floats) -> None:
 
 
 @njit(cache=True)
-def lit_by(responses: Responses, member: int) -> tuple[NDArray[np.int32], Floats]:
+def lit_by(responses: Responses, member: int) -> tuple[NDArray[np.int32], Singles]:
     """Return the pixels (n,) that a particle lights, and values (4, n or more), the first of which are theirs."""
     return responses.pixels[member][: responses.counts[member]], responses.values[member]
 
@@ -157,7 +157,7 @@ def pick(pixels: NDArray[np.int32], image: Floats, picked: Floats) -> None:
 @njit(cache=True, fastmath=SUMS, **COUNT_NO_REFERENCES)
 def normal_equations(
     pixels: NDArray[np.int32],
-    values: Floats,
+    values: Singles,
     light: float,
     observation: Observation,
     picked: Floats,
@@ -440,7 +440,7 @@ def _respond_by_waves(view: View, members: Floats, responses: Responses) -> None
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
-def _pass(passed: NDArray[np.float32], pixels: NDArray[np.int32], values: Floats) -> None:
+def _pass(passed: NDArray[np.float32], pixels: NDArray[np.int32], values: Singles) -> None:
     """Leave of light and its derivatives what reaches the pixels, all where nothing is known of it."""
     if passed.size == 0:
         return
@@ -451,7 +451,7 @@ def _pass(passed: NDArray[np.float32], pixels: NDArray[np.int32], values: Floats
 
 
 @njit(cache=True, fastmath=SUMS, **COUNT_NO_REFERENCES)
-def best_light(pixels: NDArray[np.int32], values: Floats, residual: Floats, weight: Floats) -> float:
+def best_light(pixels: NDArray[np.int32], values: Singles, residual: Floats, weight: Floats) -> float:
     """Return the light, at least 0, that a particle at this place gets by weighted least squares."""
     top = bottom = 0.0
     for k in range(pixels.size):
@@ -462,7 +462,7 @@ def best_light(pixels: NDArray[np.int32], values: Floats, residual: Floats, weig
 
 
 @njit(cache=True, fastmath=SUMS, **COUNT_NO_REFERENCES)
-def change_by(pixels: NDArray[np.int32], values: Floats, light: float, residual: Floats, weight: Floats) -> float:
+def change_by(pixels: NDArray[np.int32], values: Singles, light: float, residual: Floats, weight: Floats) -> float:
     """Return what a particle of this light adds to chi-squared."""
     change = 0.0
     for k in range(pixels.size):
@@ -472,7 +472,7 @@ def change_by(pixels: NDArray[np.int32], values: Floats, light: float, residual:
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
-def add_light(pixels: NDArray[np.int32], values: Floats, light: float, image: Floats) -> None:
+def add_light(pixels: NDArray[np.int32], values: Singles, light: float, image: Floats) -> None:
     """Add light times the response to an image."""
     for k in range(pixels.size):
         image[pixels[k]] += light * values[0, k]

@@ -1,223 +1,370 @@
-"""What one lens shows of a glowing ball, eight neighbouring pixels of a row at once.
+"""What a block of lenses shows of a glowing ball, eight pixels of a row at once.
 
-`response` has the theory. All numbers of a lens stand in the rows, `STRIDE` long, of one flat table, and loops run over
-`WIDTH` neighbours, so that the compiler makes vector code of them: it need not ask whether arrays overlap, nor what to
-do with a rest. More pixels than are asked for are written therefore, up to a whole `WIDTH`.
+`response` has the theory. Lit pixels of all of a block's columns of lenses stand side by side, as do those of its rows:
+a *column* below is a column of pixels of one column of lenses. All numbers of a block stand in the rows, `STRIDE` long,
+of one flat table, and loops run over `WIDTH` neighbours, so that the compiler makes vector code of them: it need not
+ask whether arrays overlap, nor what to do with a rest. More pixels than are asked for are written therefore, up to a
+whole `WIDTH`.
+
+Lenses of a column do not stand exactly above one another where the array is turned. Along x all follow from the
+profile in the block's middle row, at second order in how much further along x they stand (the row's `DRIFT`); and
+along y from that in its middle column.
 """
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from lfpiv_cli.arrays import Floats
-from lfpiv_cli.particles.cells import covered_share
+from lfpiv_cli.arrays import Real, Singles
+from lfpiv_cli.particles.cells import HALF, ONE, QUARTER, THREE, TWO, ZERO, covered_share
 from lfpiv_cli.threads import COUNT_NO_REFERENCES
 
-# Pixels of a row that one lens may show, and how many are worked on together.
+# Columns that a block may have, and how many are worked on together.
 LONGEST, WIDTH = 96, 8
 STRIDE = LONGEST + WIDTH
 # Three-point Gauss-Legendre on (-1, 1): exact for the cubic profile wherever it has no kink within the patch.
-GAUSS_AT = float(np.sqrt(0.6))
-GAUSS_WEIGHT = (5.0 / 18.0, 8.0 / 18.0, 5.0 / 18.0)
-# Rows of a profile: mean and slope of the share P of the ball that is seen, their derivatives by x and by z, the
-# patch's middle, and where what is seen of the ball is seen from.
-MEAN, SLOPE, MEAN_X, SLOPE_X, MEAN_Z, SLOPE_Z, PATCH, SEEN_FROM = (row * STRIDE for row in range(8))
-# In the table: the profile along x; of a row of pixels what the rim leaves of patches (covered share, means of xi and
-# eta, slopes of the share) and light and its derivatives; the profile along y.
-RIM, SHOWN, DOWN = 8 * STRIDE, 13 * STRIDE, 17 * STRIDE
-TABLE_SIZE = 25 * STRIDE
+GAUSS_AT = tuple(np.array([-np.sqrt(0.6), 0.0, np.sqrt(0.6)], np.float32))
+GAUSS_WEIGHT = tuple(np.array([5.0 / 18.0, 8.0 / 18.0, 5.0 / 18.0], np.float32))
+# Of the ball's marginal density, and of its moment.
+DENSE, MOMENT = np.float32(0.75), np.float32(0.1875)
+# Rows of a profile: mean and slope of the share P of the ball that is seen, their derivatives by x and by z, those of
+# the mean's by x, and where what is seen of the ball is seen from; the patch's middle, by how much the middle of the
+# main lens shows the ball off the lens, what the profile was moved by for bent rays, how much further the lens stands
+# along the other axis, and how far from the axis the patch lies, or its twin (`rows`) where that is nearer.
+MEAN, SLOPE, MEAN_X, SLOPE_X, MEAN_Z, SLOPE_Z, MEAN_XX, MEAN_XZ, SEEN_FROM = (row * STRIDE for row in range(9))
+PATCH, OFFSET, MOVED, DRIFT, AWAY = (row * STRIDE for row in range(9, 14))
+# In the table: the profile along x; of a row of pixels light and its derivatives; the profile along y.
+SHOWN, DOWN = 14 * STRIDE, 18 * STRIDE
+TABLE_SIZE = 32 * STRIDE
 # Of a ball; what sees less sees nothing.
-SMALLEST_SHARE = 1e-9
-# Numbers that pixels follow from beside profiles, see `join_row` and `join_curved_row`.
-JOIN_NUMBERS, CURVED_NUMBERS, OF_CUBIC = 24, 33, 21
+SMALLEST_SHARE = np.float32(1e-9)
+# What the rim leaves of a patch that it does not touch: all; see `cells.covered_share`.
+WHOLE = (ONE, ZERO, ZERO, ZERO, ZERO)
 
 VECTORISED: dict[str, Any] = {"cache": True, "fastmath": True, "error_model": "numpy", **COUNT_NO_REFERENCES}
+Four: TypeAlias = tuple[Real, Real, Real, Real]
+
+
+class Plane(NamedTuple):
+    """What pixels follow from beside profiles, of particles behind plane faces; all in single precision.
+
+    Attributes
+    ----------
+    place, tilt : the place on the main lens that a pixel sees moves by `place` with x and y, and by `tilt` (x - X) with
+        z
+    own_x, own_y : x and y
+    norm, widen : light of a whole patch that sees the whole ball, and its relative change with z
+    true_x, ..., per_distance : true x and y, and those seen, of bent rays, and 1/distance, see `refraction.Bend`
+    node_0, ..., factor_4 : of the polynomial of their slopes
+    more : what a profile changes by with these rays' slopes, over its derivative by x or y
+    """
+
+    place: Real
+    own_x: Real
+    own_y: Real
+    tilt: Real
+    norm: Real
+    widen: Real
+    true_x: Real
+    true_y: Real
+    seen_x: Real
+    seen_y: Real
+    per_distance: Real
+    node_0: Real
+    node_1: Real
+    node_2: Real
+    node_3: Real
+    factor_0: Real
+    factor_1: Real
+    factor_2: Real
+    factor_3: Real
+    factor_4: Real
+    more: Real
+
+
+class Curved(NamedTuple):
+    """What pixels of a row follow from beside profiles, of particles behind curved faces; all in single precision.
+
+    Attributes
+    ----------
+    own_x, own_y : the place in air
+    place_x, tilt_x, widen_x : along x the place on the main lens that a pixel sees moves by `place_x` with x, and by
+        `tilt_x` (x - X) with the depth that is seen along x, and what light of a whole patch changes by with that depth
+    place_y, tilt_y, widen_y : the same along y
+    norm : light of a whole patch that sees the whole ball
+    moves : how the place in air and its two depths move with x, with y and with z
+    more_x, more_y, bent_x, bent_y : what a profile changes by with rays' slopes, over its derivative by x or y, and
+        what it was moved by already
+    """
+
+    own_x: Real
+    own_y: Real
+    place_x: Real
+    tilt_x: Real
+    widen_x: Real
+    place_y: Real
+    tilt_y: Real
+    widen_y: Real
+    norm: Real
+    moves: tuple[Four, Four, Four]
+    more_x: Real
+    more_y: Real
+    bent_x: Real
+    bent_y: Real
 
 
 @njit(**VECTORISED)
-def fill_profile(out: Floats, count: int, numbers: tuple[float, ...]) -> None:
-    """Fill the rows of a profile for `count` columns; see `response`.
+def fill_profile(out: Singles, count: int, numbers: tuple[Real, ...]) -> None:
+    """Fill the rows of a profile for `count` columns whose patches and offsets stand there; see `response`.
 
     Parameters
     ----------
-    numbers : the first patch's middle on the main lens, the step to the next, and their width; a crossing X of the main
-        lens meets the array at offset + gain X from the lens; a point there moves by `by_x` with x, and with z by turn
-        (X - x); half the cell, 1/radius of the ball on the array, its relative change with z; and by how many X the
-        ball's edge is seen from elsewhere than its middle
+    numbers : the patches' width; a crossing X of the main lens meets the array at offset + gain X from the lens; a
+        point there moves by `by_x` with x, and with z by turn (X - x); half the cell, 1/radius of the ball on the
+        array, its relative change with z; and by how many X the ball's edge is seen from elsewhere than its middle
     """
-    first, step, width, offset, gain, by_x, x, turn, half, per_radius, growth, away = numbers
+    width, gain, by_x, x, turn, half, per_radius, growth, away = numbers
     for begin in range(0, count, WIDTH):
         rows = out[begin:]
         for n in range(WIDTH):
-            middle = first + step * (begin + n)
-            mean = slope = mean_x = slope_x = mean_z = slope_z = moment = 0.0
+            middle, offset = rows[PATCH + n], rows[OFFSET + n]
+            mean = slope = mean_x = slope_x = mean_z = slope_z = mean_xx = mean_xz = moment = ZERO
             for node in range(3):
-                xi, weight = (node - 1) * GAUSS_AT, GAUSS_WEIGHT[node]
-                lean = 3.0 * weight * xi
-                place = middle + 0.5 * xi * width
+                xi, weight = GAUSS_AT[node], GAUSS_WEIGHT[node]
+                lean = THREE * weight * xi
+                place = middle + HALF * xi * width
                 u = offset + gain * place
-                upper = min(max((u + half) * per_radius, -1.0), 1.0)
-                lower = min(max((u - half) * per_radius, -1.0), 1.0)
+                upper = min(max((u + half) * per_radius, -ONE), ONE)
+                lower = min(max((u - half) * per_radius, -ONE), ONE)
                 upper2, lower2 = upper * upper, lower * lower
-                share = 0.25 * (upper * (3.0 - upper2) - lower * (3.0 - lower2))
-                dense_upper, dense_lower = 0.75 - 0.75 * upper2, 0.75 - 0.75 * lower2
-                by_u = (dense_upper - dense_lower) * per_radius
-                by_z = by_u * (place - x) * turn - (dense_upper * upper - dense_lower * lower) * growth
-                moment += 0.1875 * weight * (upper2 * (2.0 - upper2) - lower2 * (2.0 - lower2))
+                share = QUARTER * (upper * (THREE - upper2) - lower * (THREE - lower2))
+                dense_upper, dense_lower = DENSE - DENSE * upper2, DENSE - DENSE * lower2
+                # Densities end at the ball's edge, and their slopes.
+                steep_upper = -TWO * DENSE * upper if upper2 < ONE else ZERO
+                steep_lower = -TWO * DENSE * lower if lower2 < ONE else ZERO
+                by_u, by_uu = (
+                    (dense_upper - dense_lower) * per_radius,
+                    (steep_upper - steep_lower) * per_radius * per_radius,
+                )
+                wider = dense_upper + steep_upper * upper - dense_lower - steep_lower * lower
+                turned = (place - x) * turn
+                by_z = by_u * turned - (dense_upper * upper - dense_lower * lower) * growth
+                by_uz = by_uu * turned - wider * per_radius * growth
+                moment += MOMENT * weight * (upper2 * (TWO - upper2) - lower2 * (TWO - lower2))
                 mean, slope = mean + weight * share, slope + lean * share
                 mean_x, slope_x = mean_x + weight * by_u * by_x, slope_x + lean * by_u * by_x
                 mean_z, slope_z = mean_z + weight * by_z, slope_z + lean * by_z
+                mean_xx, mean_xz = mean_xx + weight * by_uu * by_x * by_x, mean_xz + weight * by_uz * by_x
             rows[MEAN + n], rows[SLOPE + n] = mean, slope
+            rows[MEAN_XX + n], rows[MEAN_XZ + n] = mean_xx, mean_xz
             rows[MEAN_X + n], rows[SLOPE_X + n] = mean_x, slope_x
             rows[MEAN_Z + n], rows[SLOPE_Z + n] = mean_z, slope_z
-            rows[PATCH + n] = middle
             rows[SEEN_FROM + n] = middle + away * moment / max(mean, SMALLEST_SHARE)
 
 
-@njit(**VECTORISED)
-def cover_row(
-    table: Floats, columns: tuple[int, int], row: int, whole: tuple[int, int], width: float, radius: float
-) -> None:
-    """Fill in what the rim leaves of the patches of some columns of one row; see `cells.covered_share`.
+class Line(NamedTuple):
+    """What a row of pixels has for all its columns.
 
-    Parameters
+    Attributes
     ----------
-    columns : the first and their number
-    whole : the first one of which it leaves all, and the one behind the last
-    width, radius : of a patch, and of the main lens
+    mean, ..., moved : of its profile
+    move, across, per_drift, down : by how much profiles along x are moved, over their derivative by x, and patches are;
+        and the same along y for how much further a column's lens stands
     """
-    y = table[DOWN + SEEN_FROM + row]
-    for begin in range(columns[0], columns[0] + columns[1], WIDTH):
-        rows = table[begin:]
-        if whole[0] <= begin and min(begin + WIDTH, columns[0] + columns[1]) <= whole[1]:
-            for n in range(WIDTH):
-                rows[RIM + n] = 1.0
-                rows[RIM + STRIDE + n] = rows[RIM + 2 * STRIDE + n] = 0.0
-                rows[RIM + 3 * STRIDE + n] = rows[RIM + 4 * STRIDE + n] = 0.0
-            continue
-        for n in range(WIDTH):
-            share, mean_x, mean_y, slope_x, slope_y = covered_share(rows[SEEN_FROM + n], y, width, radius)
-            rows[RIM + n], rows[RIM + STRIDE + n], rows[RIM + 2 * STRIDE + n] = share, mean_x, mean_y
-            rows[RIM + 3 * STRIDE + n], rows[RIM + 4 * STRIDE + n] = slope_x, slope_y
+
+    mean: Real
+    slope: Real
+    mean_y: Real
+    slope_y: Real
+    mean_z: Real
+    slope_z: Real
+    mean_yy: Real
+    mean_yz: Real
+    seen_from: Real
+    patch: Real
+    moved: Real
+    move: Real
+    across: Real
+    per_drift: Real
+    down: Real
+
+
+@njit(inline="always", **VECTORISED)
+def _line(table: Singles, row: int, per_drift: Singles) -> Line:
+    """Return what a row of pixels has for all its columns."""
+    down = table[DOWN + row :]
+    return Line(
+        down[MEAN],
+        down[SLOPE],
+        down[MEAN_X],
+        down[SLOPE_X],
+        down[MEAN_Z],
+        down[SLOPE_Z],
+        down[MEAN_XX],
+        down[MEAN_XZ],
+        down[SEEN_FROM],
+        down[PATCH],
+        down[MOVED],
+        per_drift[2] * down[DRIFT],
+        per_drift[0] * down[DRIFT],
+        per_drift[3],
+        per_drift[1],
+    )
 
 
 @njit(**VECTORISED)
-def join_row(table: Floats, columns: tuple[int, int], row: int, numbers: Floats) -> None:
+def join_row(
+    table: Singles, columns: tuple[int, int], row: int, rim: tuple[Real, Real, Real], per_drift: Singles, of: Plane
+) -> None:
     """Fill in light and derivatives of some columns of one row from their profiles; see `response`.
 
     Parameters
     ----------
     columns : the first and their number
-    numbers : the place on the main lens that a pixel sees moves by [0] with x and y, which are [1] and [2], and by [3]
-        (x - X) with z; [4] light of a whole patch that sees the whole ball, [5] its relative change with z; [6] to [9]
-        true x and y, and those seen, of bent rays, and [10] 1/distance, see `refraction.Bend`; [11] to [14] nodes and
-        [15] to [19] factors of the polynomial of their slopes; [20] and [21] what a profile changes by with these rays'
-        slopes, over its derivative by x and y; [22] and [23] the same for what the profile was moved by already
+    rim : the width of a patch, the main lens's radius, and the square of the distance from its axis within which the
+        rim leaves all of a patch
+    per_drift : (4,) how much further patches lie along x and y where lenses do, and what profiles change by, over
+        their derivatives by x and y
     """
-    place_x, own_x, own_y, tilt, norm, widen = numbers[0], numbers[1], numbers[2], numbers[3], numbers[4], numbers[5]
-    true_x, true_y, seen_x, seen_y, per_distance = numbers[6], numbers[7], numbers[8], numbers[9], numbers[10]
-    node_0, node_1, node_2, node_3 = numbers[11], numbers[12], numbers[13], numbers[14]
-    factor_0, factor_1, factor_2, factor_3, factor_4 = numbers[15], numbers[16], numbers[17], numbers[18], numbers[19]
-    more_x, more_y, bent_x, bent_y = numbers[20], numbers[21], numbers[22], numbers[23]
-    v0, v1, v0_y, v1_y, v0_z, v1_z, patch_y = column_of(table, row)
-    dy = patch_y - true_y
+    line = _line(table, row, per_drift)
     for begin in range(0, columns[1], WIDTH):
         rows = table[columns[0] + begin :]
-        for n in range(WIDTH):
-            h0, h1, h0_x, h1_x = rows[MEAN + n], rows[SLOPE + n], rows[MEAN_X + n], rows[SLOPE_X + n]
-            h0_z, h1_z, patch_x = rows[MEAN_Z + n], rows[SLOPE_Z + n], rows[PATCH + n]
-            share, mean_x, mean_y = rows[RIM + n], rows[RIM + STRIDE + n], rows[RIM + 2 * STRIDE + n]
-            share_x, share_y = rows[RIM + 3 * STRIDE + n], rows[RIM + 4 * STRIDE + n]
-            whole = h0 * v0
-            # Profiles with what the rim leaves of their slopes.
-            across, down = share * h0 + mean_x * h1, share * v0 + mean_y * v1
-            light = across * v0 + mean_y * (h0 * v1)
-            by_x = h0_x * down + mean_x * (h1_x * v0) + share_x * (place_x * whole)
-            by_y = v0_y * across + mean_y * (h0 * v1_y) + share_y * (place_x * whole)
-            by_z = h0_z * down + v0_z * across + mean_x * (h1_z * v0) + mean_y * (h0 * v1_z)
-            by_z += (share_x * (own_x - patch_x) + share_y * (own_y - patch_y)) * (tilt * whole)
-            dx = patch_x - true_x
-            d2 = dx * dx + dy * dy
-            slope = factor_2 + (d2 - node_2) * (factor_3 + (d2 - node_3) * factor_4)
-            slope = factor_0 + (d2 - node_0) * (factor_1 + (d2 - node_1) * slope)
-            light += by_x * (more_x * (slope * dx - (patch_x - seen_x) * per_distance) - bent_x)
-            light += by_y * (more_y * (slope * dy - (patch_y - seen_y) * per_distance) - bent_y)
-            shown = norm if light > 0.0 else 0.0
-            rows[SHOWN + n], rows[SHOWN + STRIDE + n] = shown * light, shown * by_x
-            rows[SHOWN + 2 * STRIDE + n], rows[SHOWN + 3 * STRIDE + n] = shown * by_y, shown * (by_z + widen * light)
+        if _furthest(rows, line) < rim[2]:
+            for n in range(WIDTH):
+                _join(rows, n, line, WHOLE, of)
+        else:
+            for n in range(WIDTH):
+                _join(rows, n, line, _covered(rows, n, line, rim), of)
+
+
+@njit(inline="always", **VECTORISED)
+def _furthest(rows: Singles, line: Line) -> Real:
+    """Return the square of the largest distance of `WIDTH` patches from the axis."""
+    furthest = ZERO
+    for n in range(WIDTH):
+        x, y = rows[PATCH + n] + line.across, line.patch + line.down * rows[DRIFT + n]
+        furthest = max(furthest, x * x + y * y)
+    return furthest
+
+
+@njit(inline="always", **VECTORISED)
+def _covered(rows: Singles, n: int, line: Line, rim: tuple[Real, Real, Real]) -> tuple[Real, Real, Real, Real, Real]:
+    """Return what the rim leaves of a patch, see `cells.covered_share`."""
+    x, y = rows[SEEN_FROM + n] + line.across, line.seen_from + line.down * rows[DRIFT + n]
+    return covered_share(x, y, rim[0], rim[1])
+
+
+@njit(inline="always", **VECTORISED)
+def _join(rows: Singles, n: int, line: Line, cover: tuple[Real, Real, Real, Real, Real], of: Plane) -> None:
+    """Fill in light and derivatives of one column."""
+    share, mean_x, mean_y, share_x, share_y = cover
+    h1_x, h1_z, h0_xx, v1_y, v1_z = rows[SLOPE_X + n], rows[SLOPE_Z + n], rows[MEAN_XX + n], line.slope_y, line.slope_z
+    move_x, move_y = line.move, line.per_drift * rows[DRIFT + n]
+    h0 = rows[MEAN + n] + move_x * (rows[MEAN_X + n] + HALF * move_x * h0_xx)
+    v0 = line.mean + move_y * (line.mean_y + HALF * move_y * line.mean_yy)
+    h0_x, v0_y = rows[MEAN_X + n] + move_x * h0_xx, line.mean_y + move_y * line.mean_yy
+    h0_z, v0_z = rows[MEAN_Z + n] + move_x * rows[MEAN_XZ + n], line.mean_z + move_y * line.mean_yz
+    h1, v1 = rows[SLOPE + n] + move_x * h1_x, line.slope + move_y * v1_y
+    patch_x, patch_y = rows[PATCH + n] + line.across, line.patch + line.down * rows[DRIFT + n]
+    whole = h0 * v0
+    # Profiles with what the rim leaves of their slopes.
+    across, down = share * h0 + mean_x * h1, share * v0 + mean_y * v1
+    light = across * v0 + mean_y * (h0 * v1)
+    by_x = h0_x * down + mean_x * (h1_x * v0) + share_x * (of.place * whole)
+    by_y = v0_y * across + mean_y * (h0 * v1_y) + share_y * (of.place * whole)
+    by_z = h0_z * down + v0_z * across + mean_x * (h1_z * v0) + mean_y * (h0 * v1_z)
+    by_z += (share_x * (of.own_x - patch_x) + share_y * (of.own_y - patch_y)) * (of.tilt * whole)
+    dx, dy = patch_x - of.true_x, patch_y - of.true_y
+    d2 = dx * dx + dy * dy
+    slope = of.factor_2 + (d2 - of.node_2) * (of.factor_3 + (d2 - of.node_3) * of.factor_4)
+    slope = of.factor_0 + (d2 - of.node_0) * (of.factor_1 + (d2 - of.node_1) * slope)
+    light += by_x * (of.more * (slope * dx - (patch_x - of.seen_x) * of.per_distance) - rows[MOVED + n])
+    light += by_y * (of.more * (slope * dy - (patch_y - of.seen_y) * of.per_distance) - line.moved)
+    shown = of.norm if light > ZERO else ZERO
+    rows[SHOWN + n], rows[SHOWN + STRIDE + n] = shown * light, shown * by_x
+    rows[SHOWN + 2 * STRIDE + n], rows[SHOWN + 3 * STRIDE + n] = shown * by_y, shown * (by_z + of.widen * light)
 
 
 @njit(**VECTORISED)
-def join_curved_row(table: Floats, columns: tuple[int, int], row: int, numbers: Floats) -> None:
-    """Fill in light and derivatives of some columns of one row behind curved faces; see `response`.
+def join_curved_row(
+    table: Singles,
+    columns: tuple[int, int],
+    row: int,
+    rim: tuple[Real, Real, Real],
+    per_drift: Singles,
+    of: Curved,
+    slopes: tuple[Four, Four],
+) -> None:
+    """Fill in light and derivatives of some columns of one row behind curved faces; see `join_row`.
 
-    Parameters
-    ----------
-    columns : the first and their number
-    numbers : [0], [1] the place in air; along x the place on the main lens that a pixel sees moves by [2] with x, and
-        by [3] (x - X) with the depth that is seen along x, and what light of a whole patch changes by with that depth
-        [4]; [5] to [7] the same along y; [8] light of a whole patch that sees the whole ball; how the place in air and
-        its two depths move [9] to [12] with x, [13] to [16] with y and [17] to [20] with z; from `OF_CUBIC` on what
-        rays' slopes along x and along y differ by from straight ones', in a row: cubics of X; the last four as of
-        `join_row`
+    `slopes` is what rays' slopes along x and along y differ by from straight ones' in this row: cubics of X.
     """
-    own_x, own_y, norm = numbers[0], numbers[1], numbers[8]
-    place_x, tilt_x, widen_x = numbers[2], numbers[3], numbers[4]
-    place_y, tilt_y, widen_y = numbers[5], numbers[6], numbers[7]
-    x_by_x, y_by_x, deep_x_by_x, deep_y_by_x = numbers[9], numbers[10], numbers[11], numbers[12]
-    x_by_y, y_by_y, deep_x_by_y, deep_y_by_y = numbers[13], numbers[14], numbers[15], numbers[16]
-    x_by_z, y_by_z, deep_x_by_z, deep_y_by_z = numbers[17], numbers[18], numbers[19], numbers[20]
-    a0, a1, a2, a3 = numbers[OF_CUBIC], numbers[OF_CUBIC + 1], numbers[OF_CUBIC + 2], numbers[OF_CUBIC + 3]
-    b0, b1, b2, b3 = numbers[OF_CUBIC + 4], numbers[OF_CUBIC + 5], numbers[OF_CUBIC + 6], numbers[OF_CUBIC + 7]
-    more_x, more_y, bent_x, bent_y = numbers[29], numbers[30], numbers[31], numbers[32]
-    v0, v1, v0_y, v1_y, v0_z, v1_z, patch_y = column_of(table, row)
+    line = _line(table, row, per_drift)
     for begin in range(0, columns[1], WIDTH):
         rows = table[columns[0] + begin :]
-        for n in range(WIDTH):
-            h0, h1, h0_x, h1_x = rows[MEAN + n], rows[SLOPE + n], rows[MEAN_X + n], rows[SLOPE_X + n]
-            h0_z, h1_z, patch_x = rows[MEAN_Z + n], rows[SLOPE_Z + n], rows[PATCH + n]
-            share, mean_x, mean_y = rows[RIM + n], rows[RIM + STRIDE + n], rows[RIM + 2 * STRIDE + n]
-            share_x, share_y = rows[RIM + 3 * STRIDE + n] * (h0 * v0), rows[RIM + 4 * STRIDE + n] * (h0 * v0)
-            # Profiles with what the rim leaves of their slopes.
-            across, down = share * h0 + mean_x * h1, share * v0 + mean_y * v1
-            light = across * v0 + mean_y * (h0 * v1)
-            by_x = h0_x * down + mean_x * (h1_x * v0) + share_x * place_x
-            by_y = v0_y * across + mean_y * (h0 * v1_y) + share_y * place_y
-            light += by_x * (more_x * (a0 + patch_x * (a1 + patch_x * (a2 + patch_x * a3))) - bent_x)
-            light += by_y * (more_y * (b0 + patch_x * (b1 + patch_x * (b2 + patch_x * b3))) - bent_y)
-            deep_x = h0_z * down + mean_x * (h1_z * v0) + share_x * ((own_x - patch_x) * tilt_x) + widen_x * light
-            deep_y = v0_z * across + mean_y * (h0 * v1_z) + share_y * ((own_y - patch_y) * tilt_y) + widen_y * light
-            shown = norm if light > 0.0 else 0.0
-            rows[SHOWN + n] = shown * light
-            to_x = x_by_x * by_x + y_by_x * by_y + deep_x_by_x * deep_x + deep_y_by_x * deep_y
-            to_y = x_by_y * by_x + y_by_y * by_y + deep_x_by_y * deep_x + deep_y_by_y * deep_y
-            to_z = x_by_z * by_x + y_by_z * by_y + deep_x_by_z * deep_x + deep_y_by_z * deep_y
-            rows[SHOWN + STRIDE + n], rows[SHOWN + 2 * STRIDE + n] = shown * to_x, shown * to_y
-            rows[SHOWN + 3 * STRIDE + n] = shown * to_z
+        if _furthest(rows, line) < rim[2]:
+            for n in range(WIDTH):
+                _join_curved(rows, n, line, WHOLE, of, slopes)
+        else:
+            for n in range(WIDTH):
+                _join_curved(rows, n, line, _covered(rows, n, line, rim), of, slopes)
 
 
-@njit(**VECTORISED)
-def column_of(table: Floats, row: int) -> tuple[float, float, float, float, float, float, float]:
-    """Return what the profile along y has for a row of pixels, up to the patch's middle."""
-    down = table[DOWN + row :]
-    return down[MEAN], down[SLOPE], down[MEAN_X], down[SLOPE_X], down[MEAN_Z], down[SLOPE_Z], down[PATCH]
+@njit(inline="always", **VECTORISED)
+def _join_curved(
+    rows: Singles,
+    n: int,
+    line: Line,
+    cover: tuple[Real, Real, Real, Real, Real],
+    of: Curved,
+    slopes: tuple[Four, Four],
+) -> None:
+    """Fill in light and derivatives of one column behind curved faces, where each lens has its own profiles."""
+    share, mean_x, mean_y, share_x, share_y = cover
+    (a0, a1, a2, a3), (b0, b1, b2, b3) = slopes
+    v0, v1, h0, h1, patch_x = line.mean, line.slope, rows[MEAN + n], rows[SLOPE + n], rows[PATCH + n]
+    share_x, share_y = share_x * (h0 * v0), share_y * (h0 * v0)
+    # Profiles with what the rim leaves of their slopes.
+    across, down = share * h0 + mean_x * h1, share * v0 + mean_y * v1
+    light = across * v0 + mean_y * (h0 * v1)
+    by_x = rows[MEAN_X + n] * down + mean_x * (rows[SLOPE_X + n] * v0) + share_x * of.place_x
+    by_y = line.mean_y * across + mean_y * (h0 * line.slope_y) + share_y * of.place_y
+    light += by_x * (of.more_x * (a0 + patch_x * (a1 + patch_x * (a2 + patch_x * a3))) - of.bent_x)
+    light += by_y * (of.more_y * (b0 + patch_x * (b1 + patch_x * (b2 + patch_x * b3))) - of.bent_y)
+    deep_x = rows[MEAN_Z + n] * down + mean_x * (rows[SLOPE_Z + n] * v0)
+    deep_x += share_x * ((of.own_x - patch_x) * of.tilt_x) + of.widen_x * light
+    deep_y = line.mean_z * across + mean_y * (h0 * line.slope_z)
+    deep_y += share_y * ((of.own_y - line.patch) * of.tilt_y) + of.widen_y * light
+    shown = of.norm if light > ZERO else ZERO
+    rows[SHOWN + n] = shown * light
+    x, y, z = of.moves
+    rows[SHOWN + STRIDE + n] = shown * (x[0] * by_x + x[1] * by_y + x[2] * deep_x + x[3] * deep_y)
+    rows[SHOWN + 2 * STRIDE + n] = shown * (y[0] * by_x + y[1] * by_y + y[2] * deep_x + y[3] * deep_y)
+    rows[SHOWN + 3 * STRIDE + n] = shown * (z[0] * by_x + z[1] * by_y + z[2] * deep_x + z[3] * deep_y)
 
 
 @njit(**VECTORISED)
 def take_row(
-    table: Floats, columns: tuple[int, int], to: tuple[int, int], pixels: NDArray[np.int32], values: Floats
+    table: Singles,
+    columns: tuple[int, int],
+    to: tuple[int, NDArray[np.int64], int],
+    pixels: NDArray[np.int32],
+    values: Singles,
 ) -> None:
-    """Write what `join_row` filled in to the entries from a number on, the first of a flat pixel: both in `to`."""
-    at, pixel = to
+    """Write what `join_row` filled in to the entries from a number on.
+
+    `to` is this number, the columns' pixels in a row, and the flat number of the row's first pixel.
+    """
+    at, places, pixel = to
     named, light, by_x, by_y, by_z = pixels[at:], values[0, at:], values[1, at:], values[2, at:], values[3, at:]
     for begin in range(0, columns[1], WIDTH):
         shown = table[SHOWN + columns[0] + begin :]
         for n in range(WIDTH):
-            named[begin + n] = pixel + begin + n
+            named[begin + n] = pixel + places[columns[0] + begin + n]
         for n in range(WIDTH):
             light[begin + n] = shown[n]
         for n in range(WIDTH):

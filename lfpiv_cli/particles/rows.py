@@ -1,4 +1,4 @@
-"""The response of `response`, for fits: neighbouring pixels of a row at once, and each pixel lit only once.
+"""The response of `response`, for fits: a block of lenses at once, and each pixel lit only once.
 
 Where micro-images overlap a pixel is lit through two lenses. Its light is squared in chi-squared, so that its two parts
 must be added first: near the focal plane depths would be wrong by half a millimetre otherwise. The sum stands where the
@@ -15,25 +15,32 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from lfpiv_cli.arrays import Floats
+from lfpiv_cli.arrays import Floats, Singles
 from lfpiv_cli.particles.micro_images import (
-    CURVED_NUMBERS,
+    AWAY,
     DOWN,
-    JOIN_NUMBERS,
-    OF_CUBIC,
+    DRIFT,
+    LONGEST,
+    MOVED,
+    OFFSET,
     PATCH,
+    SHOWN,
+    STRIDE,
     TABLE_SIZE,
     WIDTH,
-    cover_row,
+    Curved,
+    Four,
+    Plane,
     fill_profile,
     join_curved_row,
     join_row,
     take_row,
 )
 from lfpiv_cli.particles.pencil import in_row
-from lfpiv_cli.particles.refraction import Bend, is_seen
+from lfpiv_cli.particles.refraction import Bend, is_seen, largest_displacement
 from lfpiv_cli.particles.response import (
     Along,
+    Bent,
     Projection,
     bent_at,
     join_cell,
@@ -51,30 +58,66 @@ SLACK = WIDTH
 
 
 class Scratch(NamedTuple):
-    """Room for what one lens shows: the table of `micro_images` and its numbers; and for where each lens does."""
+    """Room for what a block of lenses shows.
 
-    table: Floats
-    numbers: Floats
+    Attributes
+    ----------
+    table : of `micro_images`
+    per_drift : (4,) of `join_row`
+    lines : (6, STRIDE) of each column and row of the table, see `PLACE`
+    lenses : of each block, see `respond_rows`
+    """
+
+    table: Singles
+    per_drift: Singles
+    lines: NDArray[np.int64]
     lenses: NDArray[np.int64]
+
+
+# In a block's lines: a column's place on the sensor, and the earlier one in the same place or -1; the same of rows; the
+# first entry of a row, and its first column.
+PLACE, TWIN = (0, 2), (1, 3)
+ENTRY, LOW = 4, 5
+# Lenses share profiles where that moves a profile by less than this share of the ball's radius: at second order light
+# is off by less than 1e-3 then.
+SHARED = 0.05
 
 
 class Entries(NamedTuple):
     """What is written, see `respond_rows`, and the room to work it out."""
 
     pixels: NDArray[np.int32]
-    values: Floats
+    values: Singles
     room: Scratch
+
+
+class Block(NamedTuple):
+    """Lenses that share profiles.
+
+    Attributes
+    ----------
+    i, j, columns, rows : the first, and how many along i and j
+    more_mm : by how much profiles are moved at most
+    alone : whether it has all lenses
+    """
+
+    i: int
+    j: int
+    columns: int
+    rows: int
+    more_mm: float
+    alone: bool
 
 
 @njit(cache=True)
 def scratch(capacity: int) -> Scratch:
     """Return the room for so many entries."""
-    numbers = np.zeros(max(JOIN_NUMBERS, CURVED_NUMBERS))
-    return Scratch(np.zeros(TABLE_SIZE), numbers, np.empty((capacity + 1, 5), np.int64))
+    table, per_drift = np.zeros(TABLE_SIZE, np.float32), np.zeros(4, np.float32)
+    return Scratch(table, per_drift, np.zeros((6, STRIDE), np.int64), np.empty((capacity + 1, 5), np.int64))
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
-def respond_rows(view: View, bend: Bend, pixels: NDArray[np.int32], values: Floats, room: Scratch) -> int:
+def respond_rows(view: View, bend: Bend, pixels: NDArray[np.int32], values: Singles, room: Scratch) -> int:
     """Write the entries of a particle of unit light; return their number.
 
     Parameters
@@ -86,24 +129,23 @@ def respond_rows(view: View, bend: Bend, pixels: NDArray[np.int32], values: Floa
     if not is_seen(bend):
         return 0
     projection, entries = project(view, bend), Entries(pixels, values, room)
-    if bend.cubic.shape[0] > 0:
-        _set_curved_numbers(view, projection, bend, room.numbers)
-    else:
-        _set_numbers(view, projection, bend, room.numbers)
     low_i, high_i, low_j, high_j = lenses_of(view, projection, bend)
-    # Of each lens: end of its entries, first and last row, first and last column.
+    side, more_mm = _shared(view, projection, bend, (high_i + low_i) // 2, (high_j + low_j) // 2)
+    # Of each block: end of its entries, first and last row, first and last column.
     ends = room.lenses
     ends[0, 0] = 0
     shown = 0
-    for j in range(low_j, high_j + 1):
-        for i in range(low_i, high_i + 1):
-            lens = (view.centres_mm[j, i, 0], view.centres_mm[j, i, 1])
+    for j in range(low_j, high_j + 1, side):
+        for i in range(low_i, high_i + 1, side):
             begin = ends[shown, 0]
             if view.cell_table.shape[0] > 0:
+                lens = (view.centres_mm[j, i, 0], view.centres_mm[j, i, 1])
                 count = join_cell(view, projection, bend, lens, pixels[begin:], values.T[begin:])
                 _set_rectangle(pixels[begin : begin + count], view.camera.columns, ends[shown + 1])
             else:
-                count = _write_lens(view, projection, bend, lens, begin, entries, ends[shown + 1])
+                alone = high_i - low_i < side and high_j - low_j < side
+                block = Block(i, j, min(side, high_i + 1 - i), min(side, high_j + 1 - j), more_mm, alone)
+                count = _write_block(view, projection, bend, block, begin, entries, ends[shown + 1])
             if count == 0:
                 continue
             shown += 1
@@ -120,145 +162,235 @@ def respond_rows(view: View, bend: Bend, pixels: NDArray[np.int32], values: Floa
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
-def _set_numbers(view: View, projection: Projection, bend: Bend, numbers: Floats) -> None:
-    """Set the numbers of `join_row` of a particle, but for those that each lens has of its own."""
-    camera, x, y = view.camera, projection.x, projection.y
-    ratio = x.lever / x.scale
-    width = mean_width(view, projection)
-    numbers[0] = ratio * x.beta
-    numbers[1], numbers[2] = x.x, y.x
-    numbers[3] = ratio * x.slope
-    numbers[4] = width * width / (np.pi * camera.aperture_radius_mm**2)
-    numbers[5] = -2.0 * ratio * x.slope
-    for n in range(6, numbers.size):
-        numbers[n] = 0.0
-    if bend.nodes.size > 0:
-        numbers[6], numbers[7], numbers[8], numbers[9] = bend.x, bend.y, bend.seen_x, bend.seen_y
-        numbers[10] = 1.0 / bend.distance_x
-        for n in range(4):
-            numbers[11 + n] = bend.nodes[n]
-        for n in range(5):
-            numbers[15 + n] = bend.factors[n]
-        # What a profile changes by with x, over what the array point does, times what that moves by.
-        more = camera.image_distance_mm / (x.alpha * numbers[0] - x.beta)
-        numbers[20] = numbers[21] = more
+def _shared(view: View, projection: Projection, bend: Bend, i: int, j: int) -> tuple[int, float]:
+    """Return how many lenses along a side of a block share profiles, and what moves these by how much at most, mm.
+
+    Lenses that are not in line, by how much those next to lens (i, j) are not, and bent rays do.
+    """
+    if view.cell_table.shape[0] > 0 or bend.cubic.shape[0] > 0:
+        return 1, 0.0
+    centres, x, y = view.centres_mm, projection.x, projection.y
+    i, j = min(i, centres.shape[1] - 2), min(j, centres.shape[0] - 2)
+    drift = max(abs(centres[j + 1, i, 0] - centres[j, i, 0]), abs(centres[j, i + 1, 1] - centres[j, i, 1]))
+    bent = view.camera.image_distance_mm * largest_displacement(bend, view.camera.aperture_radius_mm)
+    within = SHARED * min(x.radius, y.radius)
+    if bent > within:
+        return 1, 0.0
+    # Pixels of one lens along a line at most.
+    lit = 2
+    for along in (x, y):
+        gain = max(along.stretch * abs(along.alpha), 1e-12)
+        crossed = min(view.camera.aperture_radius_mm, (along.half + along.radius + within) / gain)
+        lit = max(lit, int(2.0 * crossed * abs(along.scale) / view.camera.pixel_mm) + 2)
+    side = min(int(2.0 * within / max(drift, 1e-12)) + 1, max(LONGEST // lit, 1))
+    return side, (bent + 0.5 * (side - 1) * drift) if side > 1 else 0.0
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
-def _set_curved_numbers(view: View, projection: Projection, bend: Bend, numbers: Floats) -> None:
-    """Set the numbers of `join_curved_row` of a particle, but for those that each lens and each row has of its own."""
-    camera, x, y = view.camera, projection.x, projection.y
+def _norm(view: View, projection: Projection) -> float:
+    """Return the light of a whole patch that sees the whole ball."""
     width = mean_width(view, projection)
-    numbers[0], numbers[1] = x.x, y.x
-    for k in range(2):
-        along = x if k == 0 else y
-        ratio = along.lever / along.scale
-        numbers[2 + 3 * k] = ratio * along.beta
-        numbers[3 + 3 * k] = ratio * along.slope
-        numbers[4 + 3 * k] = -ratio * along.slope
-    numbers[8] = width * width / (np.pi * camera.aperture_radius_mm**2)
-    for j in range(3):
-        moves = seen_moves(view, bend, j)
-        for k in range(4):
-            numbers[9 + 4 * j + k] = moves[k]
+    return float(width * width / (np.pi * view.camera.aperture_radius_mm**2))
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
-def _write_lens(
+def _plane(view: View, projection: Projection, bend: Bend) -> Plane:
+    """Return what the pixels of a particle behind plane faces follow from; without bends where rays are straight."""
+    single, x, nodes, factors = np.float32, projection.x, bend.nodes, bend.factors
+    ratio, bent = x.lever / x.scale, nodes.size > 0
+    return Plane(
+        single(ratio * x.beta),
+        single(x.x),
+        single(projection.y.x),
+        single(ratio * x.slope),
+        single(_norm(view, projection)),
+        single(-2.0 * ratio * x.slope),
+        single(bend.x),
+        single(bend.y),
+        single(bend.seen_x),
+        single(bend.seen_y),
+        single(1.0 / bend.distance_x),
+        single(nodes[0] if bent else 0.0),
+        single(nodes[1] if bent else 0.0),
+        single(nodes[2] if bent else 0.0),
+        single(nodes[3] if bent else 0.0),
+        single(factors[0] if bent else 0.0),
+        single(factors[1] if bent else 0.0),
+        single(factors[2] if bent else 0.0),
+        single(factors[3] if bent else 0.0),
+        single(factors[4] if bent else 0.0),
+        single(view.camera.image_distance_mm * x.stretch / _by_place(x, x.stretch * x.alpha) if bent else 0.0),
+    )
+
+
+@njit(cache=True, **COUNT_NO_REFERENCES)
+def _curved(view: View, projection: Projection, bend: Bend, bent: Bent) -> Curved:
+    """Return what the pixels of a lens, bent by so much, of a particle behind curved faces follow from."""
+    single, (x, y), far = np.float32, projection, view.camera.image_distance_mm
+    ratio_x, ratio_y = x.lever / x.scale, y.lever / y.scale
+    by_x = _by_place(x, x.stretch * x.alpha + bent.gain_x)
+    by_y = _by_place(y, y.stretch * y.alpha + bent.gain_y)
+    return Curved(
+        single(x.x),
+        single(y.x),
+        single(ratio_x * x.beta),
+        single(ratio_x * x.slope),
+        single(-ratio_x * x.slope),
+        single(ratio_y * y.beta),
+        single(ratio_y * y.slope),
+        single(-ratio_y * y.slope),
+        single(_norm(view, projection)),
+        (_moves(view, bend, 0), _moves(view, bend, 1), _moves(view, bend, 2)),
+        single(far * x.stretch / by_x),
+        single(far * y.stretch / by_y),
+        single(bent.x / by_x),
+        single(bent.y / by_y),
+    )
+
+
+@njit(cache=True, **COUNT_NO_REFERENCES)
+def _moves(view: View, bend: Bend, axis: int) -> Four:
+    """Return `seen_moves` in single precision."""
+    x, y, deep_x, deep_y = seen_moves(view, bend, axis)
+    return np.float32(x), np.float32(y), np.float32(deep_x), np.float32(deep_y)
+
+
+@njit(cache=True, **COUNT_NO_REFERENCES)
+def _write_block(
     view: View,
     projection: Projection,
     bend: Bend,
-    lens: tuple[float, float],
+    block: Block,
     begin: int,
     entries: Entries,
     rectangle: NDArray[np.int64],
 ) -> int:
-    """Write the entries of one lens with a rectangular cell from `begin` on; return their number.
+    """Write the entries of a block of lenses with rectangular cells from `begin` on; return their number.
 
     Sets the rectangle of pixels that they lie in: first and last row, first and last column, from the second number on.
     """
     camera, room, x, y = view.camera, entries.room, projection.x, projection.y
-    numbers = room.numbers
-    bent = bent_at(view, projection, bend, lens[0], lens[1])
-    gain_x, gain_y = x.stretch * x.alpha + bent.gain_x, y.stretch * y.alpha + bent.gain_y
-    offset_x, offset_y = x.at + bent.x - lens[0], y.at + bent.y - lens[1]
-    shift_x = (1.0 - camera.bend) * lens[0] - x.lever * x.beta * x.x
-    shift_y = (1.0 - camera.bend) * lens[1] - y.lever * y.beta * y.x
-    column, columns = lit_pixels(view, gain_x, offset_x, x.half + x.radius, x.scale, shift_x, camera.columns)
+    middle = view.centres_mm[block.j + block.rows // 2, block.i + block.columns // 2]
+    bent = bent_at(view, projection, bend, middle[0], middle[1])
+    columns = _line_up(view, projection, bend, block, 0, room)
     if columns == 0:
         return 0
-    row, rows = lit_pixels(view, gain_y, offset_y, y.half + y.radius, y.scale, shift_y, camera.rows)
+    _set_away(room, columns)
+    if block.alone:
+        _order_columns(room, columns, mean_width(view, projection))
+    rows = _line_up(view, projection, bend, block, 1, room)
     if rows == 0:
         return 0
-    step_x, step_y = camera.pixel_mm / x.scale, camera.pixel_mm / y.scale
-    first_x = ((column + 0.5 - 0.5 * camera.columns) * camera.pixel_mm - shift_x) / x.scale
-    first_y = ((row + 0.5 - 0.5 * camera.rows) * camera.pixel_mm - shift_y) / y.scale
-    width = mean_width(view, projection)
-    if _nearest(first_x, step_x, columns) + _nearest(first_y, step_y, rows) >= _far(view, width):
-        return 0
-    _fill(view, x, (first_x, offset_x, gain_x), columns, room.table)
-    _fill(view, y, (first_y, offset_y, gain_y), rows, room.table[DOWN:])
-    if bend.cubic.shape[0] > 0:
-        _set_bent(view, x, bent.x, bent.gain_x, numbers[CURVED_NUMBERS - 4 :])
-        _set_bent(view, y, bent.y, bent.gain_y, numbers[CURVED_NUMBERS - 3 :])
-    elif bend.nodes.size > 0:
-        per_array = numbers[20] / camera.image_distance_mm
-        numbers[22] = per_array / x.stretch * bent.x
-        numbers[23] = per_array / y.stretch * bent.y
-    lit = (row, rows), (column, columns)
-    far = camera.image_distance_mm
-    rises = bent.gain_x / (x.stretch * far), bent.gain_y / (y.stretch * far)
-    # How far from a patch the edge of the ball is seen from, at most.
-    away = np.hypot(x.lever * x.beta * x.ball / x.scale, y.lever * y.beta * y.ball / y.scale)
-    patches = step_x, width, away
-    return _write_rows(view, (bend.cubic, rises), lit, patches, begin, entries, rectangle)
+    _fill(view, x, x.stretch * x.alpha + bent.gain_x, columns, room.table)
+    _fill(view, y, y.stretch * y.alpha + bent.gain_y, rows, room.table[DOWN:])
+    for k in range(2):
+        along = x if k == 0 else y
+        # With a lens that stands further along its image does, and what the lens is off the ball.
+        further = (1.0 - camera.bend) / along.scale
+        gain = along.stretch * along.alpha
+        room.per_drift[k] = -further
+        room.per_drift[2 + k] = -(1.0 + gain * further) / _by_place(along, gain)
+    return _write_rows(view, projection, bend, bent, (rows, columns), begin, entries, rectangle)
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
-def _set_bent(view: View, along: Along, bent: float, gain: float, numbers: Floats) -> None:
-    """Set along one axis what profiles change by with rays' slopes, and did already; see `join_row`."""
-    place = along.lever / along.scale * along.beta
-    by_x = along.stretch * (along.alpha * place - along.beta) + gain * place
-    numbers[0] = along.stretch * view.camera.image_distance_mm / by_x
-    numbers[2] = bent / by_x
+def _by_place(along: Along, gain: float) -> float:
+    """Return how what a lens is off the ball, as a pixel sees it, changes with the ball's place."""
+    return along.beta * (gain * along.lever / along.scale - along.stretch)
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
-def _nearest(first: float, step: float, count: int) -> float:
-    """Return the square of the smallest of |first + n step|."""
-    last = first + (count - 1) * step
-    return 0.0 if first * last <= 0.0 else min(abs(first), abs(last)) ** 2
+def _line_up(view: View, projection: Projection, bend: Bend, block: Block, axis: int, room: Scratch) -> int:
+    """Put the lit pixels of a block's lenses side by side along an axis, 0 for x; return their number.
 
-
-@njit(cache=True, **COUNT_NO_REFERENCES)
-def _far(view: View, width: float) -> float:
-    """Return the square of how far from the axis a patch is that the rim does not touch, from outside."""
-    return float((view.camera.aperture_radius_mm + 0.71 * width) ** 2)
-
-
-@njit(cache=True, **COUNT_NO_REFERENCES)
-def _fill(view: View, along: Along, patches: tuple[float, float, float], count: int, out: Floats) -> None:
-    """Fill the profile of one lens along an axis.
-
-    `patches` are the first patch, and what the array is off by and how that grows with X.
+    Sets the patches, offsets and drifts of a profile, and the lines' places.
     """
-    first, offset, gain = patches
-    camera = view.camera
-    step = camera.pixel_mm / along.scale
+    camera, centres = view.camera, view.centres_mm
+    along = projection.x if axis == 0 else projection.y
+    table, places, twins = room.table[DOWN * axis :], room.lines[PLACE[axis]], room.lines[TWIN[axis]]
+    middle_i, middle_j = block.i + block.columns // 2, block.j + block.rows // 2
+    middle = centres[middle_j, middle_i, 1 - axis]
+    by_place = _by_place(along, along.stretch * along.alpha)
+    count = 0
+    for n in range(block.columns if axis == 0 else block.rows):
+        i, j = (block.i + n, middle_j) if axis == 0 else (middle_i, block.j + n)
+        s = centres[j, i, axis]
+        bent = bent_at(view, projection, bend, centres[j, i, 0], centres[j, i, 1])
+        moved, gain = (bent.x, bent.gain_x) if axis == 0 else (bent.y, bent.gain_y)
+        offset, gain = along.at + moved - s, along.stretch * along.alpha + gain
+        shift = (1.0 - camera.bend) * s - along.lever * along.beta * along.x
+        reach = along.half + along.radius + block.more_mm
+        first, number = lit_pixels(view, gain, offset, reach, along.scale, shift, along.pixels)
+        for place in range(first, first + min(number, LONGEST - count)):
+            table[PATCH + count] = ((place + 0.5 - 0.5 * along.pixels) * camera.pixel_mm - shift) / along.scale
+            table[OFFSET + count], table[DRIFT + count] = offset, centres[j, i, 1 - axis] - middle
+            table[MOVED + count] = moved / by_place
+            places[count], twins[count] = place, -1
+            before = count - 1
+            while before >= 0 and places[before] > place:
+                before -= 1
+            if before >= 0 and places[before] == place:
+                twins[count] = before if twins[before] < 0 else twins[before]
+            count += 1
+    return count
+
+
+@njit(cache=True, **COUNT_NO_REFERENCES)
+def _set_away(room: Scratch, columns: int) -> None:
+    """Set how far from the axis the patches of columns lie, or their twins' where these are nearer."""
+    table, twins = room.table, room.lines[TWIN[0]]
+    for n in range(columns):
+        table[AWAY + n] = abs(table[PATCH + n])
+        if twins[n] >= 0:
+            nearer = min(table[AWAY + n], table[AWAY + twins[n]])
+            table[AWAY + n] = table[AWAY + twins[n]] = nearer
+
+
+@njit(cache=True, **COUNT_NO_REFERENCES)
+def _order_columns(room: Scratch, columns: int, width: float) -> None:
+    """Order columns by how far from the axis their patches, of this width, lie, to a quarter of a patch.
+
+    Of a row of pixels those that the main lens's rim cuts off come last then, those that it touches before them, and
+    all others stand side by side.
+    """
+    table, lines = room.table, room.lines
+    starts, targets, places, twins = lines[ENTRY], lines[LOW], lines[PLACE[1]], lines[TWIN[1]]
+    per = 4.0 / width
+    for n in range(STRIDE):
+        starts[n] = 0
+    for n in range(columns):
+        places[n], twins[n] = lines[PLACE[0], n], lines[TWIN[0], n]
+        starts[min(int(table[AWAY + n] * per) + 1, STRIDE - 1)] += 1
+    for n in range(1, STRIDE):
+        starts[n] += starts[n - 1]
+    for n in range(columns):
+        step = min(int(table[AWAY + n] * per), STRIDE - 2)
+        targets[n] = starts[step]
+        starts[step] += 1
+    for k in range(5):
+        for n in range(columns):
+            table[n] = table[PATCH + k * STRIDE + n]
+        for n in range(columns):
+            table[PATCH + k * STRIDE + targets[n]] = table[n]
+    for n in range(columns):
+        lines[PLACE[0], targets[n]] = places[n]
+        lines[TWIN[0], targets[n]] = targets[twins[n]] if twins[n] >= 0 else -1
+
+
+@njit(cache=True, **COUNT_NO_REFERENCES)
+def _fill(view: View, along: Along, gain: float, count: int, out: Singles) -> None:
+    """Fill the profile of lenses along an axis; what the array is off by grows by `gain` with X."""
     ratio = along.lever / along.scale
     numbers = (
-        first,
-        step,
-        abs(step),
-        offset,
-        gain,
-        gain * ratio * along.beta - along.beta * along.stretch,
-        along.x,
-        along.slope * (along.stretch - gain * ratio),
-        along.half,
-        1.0 / along.radius,
-        along.growth,
-        ratio * along.beta * along.ball,
+        np.float32(abs(view.camera.pixel_mm / along.scale)),
+        np.float32(gain),
+        np.float32(_by_place(along, gain)),
+        np.float32(along.x),
+        np.float32(along.slope * (along.stretch - gain * ratio)),
+        np.float32(along.half),
+        np.float32(1.0 / along.radius),
+        np.float32(along.growth),
+        np.float32(ratio * along.beta * along.ball),
     )
     fill_profile(out, count, numbers)
 
@@ -266,69 +398,114 @@ def _fill(view: View, along: Along, patches: tuple[float, float, float], count: 
 @njit(cache=True, **COUNT_NO_REFERENCES)
 def _write_rows(
     view: View,
-    bent: tuple[Floats, tuple[float, float]],
-    lit: tuple[tuple[int, int], tuple[int, int]],
-    patches: tuple[float, float, float],
+    projection: Projection,
+    bend: Bend,
+    bent: Bent,
+    lit: tuple[int, int],
     begin: int,
     entries: Entries,
     rectangle: NDArray[np.int64],
 ) -> int:
-    """Write the entries of one lens whose profiles are known, row by row; see `_write_lens`.
+    """Write the entries of a block whose profiles are known, row by row; see `_write_block`.
 
     Parameters
     ----------
-    bent : `Bend.cubic`, and the slopes of its tangents that profiles follow already
-    lit : first row and their number, first column and their number
-    patches : the step along x from one to the next, their mean width, and how far from them a ball is seen from at most
+    bent : of the middle lens
+    lit : the numbers of rows and of columns
     """
-    camera, (pixels, values, room) = view.camera, entries
-    (row, rows), (column, columns) = lit
-    cubic, tangent = bent
-    step, width, away = patches
-    outside = _far(view, width)
-    # Of patches that the rim, with its sagitta, does not touch, seen from wherever they are.
-    inside = max(camera.aperture_radius_mm - 0.75 * width - away, 0.0) ** 2
-    table, first = room.table, room.table[PATCH]
-    at = begin
-    rectangle[1], rectangle[2], rectangle[3], rectangle[4] = row + rows, -1, column + columns, -1
+    camera, (pixels, values, room), (x, y) = view.camera, entries, projection
+    (rows, columns), table, lines, per_drift = lit, room.table, room.lines, room.per_drift
+    radius, width = camera.aperture_radius_mm, mean_width(view, projection)
+    # Further from the axis, wherever its lens stands, a patch is that the rim does not touch from outside.
+    outside = (radius + 0.71 * width + _drifts(table, columns, rows, per_drift)) ** 2
+    # Of patches that the rim, with its sagitta, does not touch, from wherever the edge of the ball is seen.
+    away = np.hypot(x.lever * x.beta * x.ball / x.scale, y.lever * y.beta * y.ball / y.scale)
+    inside = max(radius - 0.75 * width - away, 0.0) ** 2
+    rim = np.float32(width), np.float32(radius), np.float32(inside)
+    of_plane, of_curved = _plane(view, projection, bend), _curved(view, projection, bend, bent)
+    at, twice_lit = begin, False
+    for n in range(columns):
+        twice_lit = twice_lit or lines[TWIN[0], n] >= 0
+    rectangle[1], rectangle[2], rectangle[3], rectangle[4] = camera.rows, -1, camera.columns, -1
     for m in range(rows):
-        y = table[DOWN + PATCH + m]
-        low, high = _columns_within(outside - y * y, first, step, columns)
+        low, high = _columns_within(table, columns, outside - table[DOWN + PATCH + m] ** 2)
+        lines[ENTRY, m], lines[LOW, m] = at, low
         if low >= high or at + high - low + SLACK > pixels.size:
+            lines[LOW, m] = columns
             continue
-        chosen, whole = (low, high - low), _columns_within(inside - y * y, first, step, columns)
-        cover_row(table, chosen, m, whole, width, camera.aperture_radius_mm)
-        if cubic.shape[0] > 0:
-            _set_row(cubic, tangent, y, room.numbers)
-            join_curved_row(table, chosen, m, room.numbers)
+        chosen = (low, high - low)
+        if bend.cubic.shape[0] > 0:
+            slopes = _slopes(view, projection, bend.cubic, bent, table[DOWN + PATCH + m])
+            join_curved_row(table, chosen, m, rim, per_drift, of_curved, slopes)
         else:
-            join_row(table, chosen, m, room.numbers)
-        take_row(table, chosen, (at, (row + m) * camera.columns + column + low), pixels, values)
+            join_row(table, chosen, m, rim, per_drift, of_plane)
+        if twice_lit:
+            _join_twin_columns(table, lines[TWIN[0]], low, high)
+        row = lines[PLACE[1], m]
+        take_row(table, chosen, (at, lines[PLACE[0]], row * camera.columns), pixels, values)
         at += high - low
-        rectangle[1], rectangle[2] = min(rectangle[1], row + m), row + m
-        rectangle[3], rectangle[4] = min(rectangle[3], column + low), max(rectangle[4], column + high - 1)
+        twin = lines[TWIN[1], m]
+        if twin >= 0:
+            _join_twin_rows(lines, (twin, lines[ENTRY, twin + 1]), (m, at), values)
+        rectangle[1], rectangle[2] = min(rectangle[1], row), max(rectangle[2], row)
+        rectangle[3], rectangle[4] = min(rectangle[3], lines[0, low]), max(rectangle[4], lines[0, high - 1])
     return at - begin
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
-def _set_row(cubic: Floats, tangent: tuple[float, float], y: float, numbers: Floats) -> None:
-    """Set the cubics of X that a row has, of `join_curved_row`, without the tangents that profiles follow."""
-    for k in range(2):
-        at = OF_CUBIC + 4 * k
-        numbers[at], numbers[at + 1], numbers[at + 2], numbers[at + 3] = in_row(cubic[k], y)
-    numbers[OF_CUBIC + 1] -= tangent[0]
-    numbers[OF_CUBIC + 4] -= tangent[1] * y
+def _slopes(view: View, projection: Projection, cubic: Floats, bent: Bent, y: float) -> tuple[Four, Four]:
+    """Return the cubics of X that a row has, without the tangents that profiles follow already."""
+    far, single = view.camera.image_distance_mm, np.float32
+    rise_x, rise_y = bent.gain_x / (projection.x.stretch * far), bent.gain_y / (projection.y.stretch * far)
+    a0, a1, a2, a3 = in_row(cubic[0], y)
+    b0, b1, b2, b3 = in_row(cubic[1], y)
+    return (
+        (single(a0), single(a1 - rise_x), single(a2), single(a3)),
+        (single(b0 - rise_y * y), single(b1), single(b2), single(b3)),
+    )
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
-def _columns_within(square: float, first: float, step: float, columns: int) -> tuple[int, int]:
-    """Return the first n of those whose (first + n step)^2 is below `square`, and the one behind the last."""
-    if square <= 0.0:
-        return 0, 0
-    reach = np.sqrt(square)
-    one, other = (-reach - first) / step, (reach - first) / step
-    low, high = int(np.ceil(min(one, other))), int(np.floor(max(one, other))) + 1
-    return max(low, 0), min(high, columns)
+def _join_twin_columns(table: Singles, twins: NDArray[np.int64], low: int, high: int) -> None:
+    """Move what some columns show to earlier ones in the same places."""
+    for n in range(low, high):
+        if low <= twins[n] < high:
+            for k in range(4):
+                at = SHOWN + k * STRIDE
+                table[at + twins[n]] += table[at + n]
+                table[at + n] = 0.0
+
+
+@njit(cache=True, **COUNT_NO_REFERENCES)
+def _join_twin_rows(lines: NDArray[np.int64], one: tuple[int, int], other: tuple[int, int], values: Singles) -> None:
+    """Move what a row's entries have to those of an earlier row in the same place: each a row, and its entries' end."""
+    a, b = lines[ENTRY, one[0]] - lines[LOW, one[0]], lines[ENTRY, other[0]] - lines[LOW, other[0]]
+    for n in range(max(lines[LOW, one[0]], lines[LOW, other[0]]), min(one[1] - a, other[1] - b)):
+        for k in range(values.shape[0]):
+            values[k, a + n] += values[k, b + n]
+            values[k, b + n] = np.float32(0.0)
+
+
+@njit(cache=True, **COUNT_NO_REFERENCES)
+def _drifts(table: Singles, columns: int, rows: int, per_drift: Singles) -> float:
+    """Return by how much patches of a block may lie elsewhere than their column and their row have them."""
+    across = down = np.float32(0.0)
+    for n in range(columns):
+        down = max(down, abs(per_drift[1] * table[DRIFT + n]))
+    for m in range(rows):
+        across = max(across, abs(per_drift[0] * table[DOWN + DRIFT + m]))
+    return float(across + down)
+
+
+@njit(cache=True, **COUNT_NO_REFERENCES)
+def _columns_within(table: Singles, columns: int, square: float) -> tuple[int, int]:
+    """Return the first column whose patch is nearer to the axis than the root of `square`, and behind the last one."""
+    low, high = 0, columns
+    while low < high and table[AWAY + low] * table[AWAY + low] >= square:
+        low += 1
+    while high > low and table[AWAY + high - 1] * table[AWAY + high - 1] >= square:
+        high -= 1
+    return low, high
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
@@ -344,7 +521,7 @@ def _set_rectangle(pixels: NDArray[np.int32], columns: int, rectangle: NDArray[n
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
-def _join_twice_lit(one: tuple[int, int], other: tuple[int, int], pixels: NDArray[np.int32], values: Floats) -> None:
+def _join_twice_lit(one: tuple[int, int], other: tuple[int, int], pixels: NDArray[np.int32], values: Singles) -> None:
     """Move what a lens lights of another's pixels to that one's entries; either's (first, end) ascend."""
     a, b = one[0], other[0]
     while a < one[1] and b < other[1]:
