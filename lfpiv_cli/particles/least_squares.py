@@ -19,7 +19,7 @@ from functools import cache
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
-from numba import cfunc, config, float64, int64, njit, typeof, types, void
+from numba import cfunc, config, float64, njit, typeof, void
 from numba.core.typing.templates import Signature
 from numba.core.typing.typeof import typeof_impl
 from numpy.typing import NDArray
@@ -28,7 +28,7 @@ from lfpiv_cli.arrays import Floats, Singles
 from lfpiv_cli.particles.line_light import VALUES, respond_by_lines
 from lfpiv_cli.particles.refraction import bend_of
 from lfpiv_cli.particles.rows import SLACK, Scratch, respond_rows, scratch
-from lfpiv_cli.particles.view import LARGEST_MOVE_LENSES, View, by_waves, entry_capacity
+from lfpiv_cli.particles.view import LARGEST_MOVE_LENSES, View, by_waves, entry_capacity, type_by_form
 from lfpiv_cli.threads import COUNT_NO_REFERENCES
 
 UNKNOWNS = 4
@@ -98,17 +98,7 @@ class Observation(NamedTuple):
         return self.low_mm, self.high_mm
 
 
-@typeof_impl.register(Observation)
-def _type_of(observation: Observation, _purpose: object) -> types.Type:
-    """Return numba's type; it would look at all that a view holds each time a kernel is called, for half a ms."""
-    return _observation_type(observation.respond, typeof(observation.residual), typeof(observation.weight))
-
-
-@cache
-def _observation_type(respond: Respond, residual: types.Type, weight: types.Type) -> types.Type:
-    address = typeof(respond)
-    members = [address, address.signature.args[0], residual, weight, float64, float64, int64]
-    return types.NamedTuple(members, Observation)
+typeof_impl.register(Observation)(type_by_form)
 
 
 def observation_of(view: View, residual: Floats, weight: Floats, depths_mm: tuple[float, float]) -> Observation:

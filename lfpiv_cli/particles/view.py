@@ -12,9 +12,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from numba import types
+from numba.core.typing.typeof import Purpose, typeof_impl
 from numpy.typing import NDArray
 
 from lfpiv_cli.arrays import Floats
@@ -82,6 +84,30 @@ class View(NamedTuple):
     points: LineResponses
     diffusion_px: float
     passed: NDArray[np.float32]
+
+
+def type_by_form(value: tuple[Any, ...], purpose: Purpose) -> types.Type:
+    """Return numba's type of a named tuple; it would look at all that is in one each time a kernel is called.
+
+    Views and what holds them are taken apart to their arrays' forms alone: 20 us of 400.
+    """
+    form = type(value), _form(value)
+    if form not in _types:
+        _types[form] = typeof_impl.dispatch(tuple)(value, purpose)
+    return _types[form]
+
+
+_types: dict[object, types.Type] = {}
+
+
+def _form(value: object) -> object:
+    """Return what a type follows from: of arrays what they hold, their dimensions and their layout."""
+    if isinstance(value, tuple):
+        return tuple([_form(each) for each in value])
+    return (value.dtype.char, value.ndim, value.flags.num) if isinstance(value, np.ndarray) else type(value)
+
+
+typeof_impl.register(View)(type_by_form)
 
 
 @dataclass(frozen=True)
