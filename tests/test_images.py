@@ -151,6 +151,20 @@ def test_uneven_or_faint_haze_is_found(camera: Camera, water: Media, rng: np.ran
         assert faint.level_counts == pytest.approx(12.0, abs=3.0)
 
 
+def test_haze_of_few_counts_is_found_where_a_count_is_of_many_photons(
+    camera: Camera, water: Media, rng: np.random.Generator
+):
+    """1.8 counts of noise of 2.4."""
+    camera = replace(camera, columns=400, rows=320)
+    (true, white), count = white_of(camera, rng), 0.15
+    noise = count * BACKGROUND[1]
+    light = count * (tracers(camera, water, 0.4, rng) + 12.0 * true)
+    recorded = Readout(PHOTONS_PER_COUNT / count, noise, 0.0).record(light + 100.0 * count, rng) - 100.0 * count
+    found = white.haze_in(recorded.astype(np.float32), np.ones(light.shape, np.bool_), (0.0, noise))
+    assert found is not None
+    assert found.level_counts == pytest.approx(12.0 * count, abs=3.0 * count)
+
+
 @pytest.mark.parametrize("photons_per_count", [0.5, 0.01])
 def test_tracers_are_no_haze(camera: Camera, water: Media, rng: np.random.Generator, photons_per_count: float):
     """Of four for each microlens a third of the light is in the darkest pixels of all."""

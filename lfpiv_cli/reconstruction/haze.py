@@ -47,8 +47,8 @@ UNEVENNESS, COOLING = 0.15, 0.7
 # noise the pixels that a tracer lights have much: with 2 standard deviations depths were 8 % too small.
 LEAST_DARK, LEAST_SIGMAS = 0.05, 2.5
 MUCH_DARK, LEAST_SIGMAS_OF_DARK = 0.15, 0.4
-# Fewer counts are what rounding and a dark level that drifts leave.
-LEAST_COUNTS = 2.0
+# Fewer counts are what rounding leaves; a dark level that drifts is that of pixels between the lens images, too.
+LEAST_COUNTS = 1.0
 # How far below it noise is looked at, and how far to either side texture.
 BELOW_SIGMAS, NEAR_SIGMAS = 4.0, 2.0
 # Share of the variance that pixels side by side have in common: of haze of 50 to 5,000 counts, with up to 0.65 tracers
