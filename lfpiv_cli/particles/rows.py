@@ -290,7 +290,7 @@ def _write_block(
         gain = along.stretch * along.alpha
         room.per_drift[k] = -further
         room.per_drift[2 + k] = -(1.0 + gain * further) / _by_place(along, gain)
-    return _write_rows(view, projection, bend, bent, (rows, columns), begin, entries, rectangle)
+    return _write_rows(view, projection, (bend, bent), (rows, columns), begin, entries, rectangle)
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
@@ -399,8 +399,7 @@ def _fill(view: View, along: Along, gain: float, count: int, out: Singles) -> No
 def _write_rows(
     view: View,
     projection: Projection,
-    bend: Bend,
-    bent: Bent,
+    rays: tuple[Bend, Bent],
     lit: tuple[int, int],
     begin: int,
     entries: Entries,
@@ -410,10 +409,10 @@ def _write_rows(
 
     Parameters
     ----------
-    bent : of the middle lens
+    rays : of the particle, and what they are moved by through the middle lens
     lit : the numbers of rows and of columns
     """
-    camera, (pixels, values, room), (x, y) = view.camera, entries, projection
+    camera, (pixels, values, room), (x, y), (bend, bent) = view.camera, entries, projection, rays
     (rows, columns), table, lines, per_drift = lit, room.table, room.lines, room.per_drift
     radius, width = camera.aperture_radius_mm, mean_width(view, projection)
     # Further from the axis, wherever its lens stands, a patch is that the rim does not touch from outside.
