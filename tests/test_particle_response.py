@@ -204,6 +204,8 @@ def test_rows_are_the_pixels_one_by_one(any_view: View, place: tuple[float, floa
     least = 1e-6 * largest[0]
     lit = found[: named.size, 0] > least
     assert np.unique(named[lit]).size == np.count_nonzero(lit)
+    # It is the first that names the pixel, by which pixels that two particles light are found.
+    assert np.isin(np.flatnonzero(lit), np.unique(named, return_index=True)[1]).all()
 
 
 def test_weights_of_pixels_are_those_of_the_noise(rng: np.random.Generator) -> None:

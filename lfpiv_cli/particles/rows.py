@@ -348,7 +348,7 @@ def _set_away(room: Scratch, columns: int) -> None:
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
 def _order_columns(room: Scratch, columns: int, width: float) -> None:
-    """Order columns by how far from the axis their patches, of this width, lie, to a quarter of a patch.
+    """Order columns by how far from the axis their patches, of this width, lie, to a quarter of a patch; twins stay so.
 
     Of a row of pixels those that the main lens's rim cuts off come last then, those that it touches before them, and
     all others stand side by side.
