@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lfpiv_cli.calibration.model import Calibration
 from lfpiv_cli.console import CONSOLE, Console
 from lfpiv_cli.errors import ConfigError, InputError, UsageError
 from lfpiv_cli.files import atomic, calibration_file, hdf5, images, inputs, pages, particle_file, vtkhdf, weights_file
@@ -180,9 +181,14 @@ def of_volume(volume: vtkhdf.Volume) -> Figures:
     }
 
 
+def of_calibration(calibration: Calibration) -> Figures:
+    """Return the figures of a calibration."""
+    return {"summary": partial(pictures.summary_figure, calibration)}
+
+
 def _of_calibration_in(path: Path, white: Path | None) -> Figures:
     calibration = calibration_file.open_calibration(path)
-    figures: Figures = {"summary": partial(pictures.summary_figure, calibration)}
+    figures = of_calibration(calibration)
     if white is not None:
         image = images.read_single(white, calibration.image_shape)
         figures["lattice"] = partial(pictures.calibration_figure, calibration, image)
