@@ -144,7 +144,7 @@ Stamp = tuple[int, int] | None
 
 
 def stamp_of(path: Path) -> Stamp:
-    """Return what tells a file from another one under its name, None where there is none."""
+    """Return what distinguishes a file from another one under its name, None where there is none."""
     try:
         status = path.stat()
     except OSError:

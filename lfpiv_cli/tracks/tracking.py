@@ -183,7 +183,7 @@ FURTHEST_SIGMAS = 12.0
 WRONG_LENSES = 0.3
 # A link is kept that is more likely than all its alternatives together.
 LEAST_PROBABILITY = 0.5
-# Links are of one motion where the logarithms of their odds against chance, each by what the others let expect, sum up
+# Links are of one motion where the logarithms of their odds against chance, each by what the others predict, sum up
 # to the first, or come to the second for each of the links of more than half of the particles. In unrelated images they
 # came to 53 at most, and to 2.5.
 SURE_ODDS, SURE_ODDS_EACH = 60.0, 2.7
@@ -199,7 +199,7 @@ class Tracks:
     ----------
     first, second : (n,) numbers of the particles in the two frames
     probability : (n,) of the links, from the alternatives
-    log_odds : sum of the logarithms of the links' odds against chance, each by what the others let expect
+    log_odds : sum of the logarithms of the links' odds against chance, each by what the others predict
     """
 
     first: Integers
