@@ -18,12 +18,12 @@ import numpy as np
 import pytest
 import tifffile
 
+import lfpiv_cli as lf
 from lfpiv_cli.cli.options import print_json
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.files import recording_formats as formats
 from lfpiv_cli.files.images import count_pages, read_image, read_single, write_tiff
 from lfpiv_cli.files.listing import ensure_verified
-from lfpiv_cli.files.recording import taken_complaints
 from tests import camera_files
 from tests.commands import CONFIG, ROOT, SAMPLE, refused
 from tests.hostile_files import ended
@@ -382,9 +382,12 @@ def test_what_a_decoder_complains_of_is_a_warning(tmp_path: Path, capsys: pytest
     place = content.index(struct.pack("<HH", 305, 2))
     content[place + 2 : place + 4] = struct.pack("<H", 99)  # a kind of tag that there is not
     frame.write_bytes(content)
-    taken_complaints()
     assert ended("check", CONFIG, frame) == (0, "")
     assert "a.tif: the decoder says: " in capsys.readouterr().err
+    with pytest.warns(lf.LfpivWarning, match=r"a\.tif: the decoder says: "):
+        read_single(frame)
+    assert ended("check", CONFIG, SAMPLE / "pair_a.tif") == (0, "")
+    assert capsys.readouterr().err == ""
 
 
 @pytest.mark.parametrize("layout", [{}, {"rowsperstrip": 64}, {"tile": (64, 64)}], ids=str)

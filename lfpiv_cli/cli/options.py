@@ -347,7 +347,7 @@ def common_options(command: Callable[..., dict[str, Any]]) -> Callable[..., None
     ) -> None:
         from lfpiv_cli.console import Console
         from lfpiv_cli.files.atomic import EventLog, place_of
-        from lfpiv_cli.files.recording import taken_complaints
+        from lfpiv_cli.files.recording import complaints_kept
         from lfpiv_cli.notice import Notice
 
         warned: list[Notice] = []
@@ -374,13 +374,14 @@ def common_options(command: Callable[..., dict[str, Any]]) -> Callable[..., None
                 read = _flat(value for name, value in given.items() if name not in OUTPUTS)
                 texts = {each for each in read if isinstance(each, str) and os.path.exists(each)}
                 ensure_verified(verify, [Path(each) for each in read if isinstance(each, Path) or each in texts])
-            summary = command(console=console, **given)
+            with complaints_kept() as complaints:
+                summary = command(console=console, **given)
         except (LimitMissedError, PartialError) as error:
             ended_with, summary = error, error.figures
         except BaseException as error:
             console.event("error", **error_record(error))
             raise
-        console.warn(taken_complaints())
+        console.warn(complaints)
         ended = error_record(ended_with) if ended_with else {"exit_code": 0}
         console.event("end", summary=summary, **ended)
         if kernel_cache.lost and "numba" in sys.modules:

@@ -10,7 +10,9 @@ import logging
 import math
 import re
 import struct
-from collections.abc import Callable, Mapping, Sequence
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,23 +23,24 @@ from numpy.typing import NDArray
 
 from lfpiv_cli.errors import InputError, UsageError
 from lfpiv_cli.files.inputs import opened, split_page, split_part
-from lfpiv_cli.notice import Notice
+from lfpiv_cli.notice import LfpivWarning, Notice
 
-# What the decoders of images complain of, kept until the command tells it: formats without check sums have no more.
+# What the decoders of images complain of, kept until the command reports it: formats without check sums have no more.
 
 # Of a damaged file there can be one for each page.
 MOST_KEPT = 20
 
 # The file that is read.
 reading: ContextVar[Path | None] = ContextVar("reading", default=None)
-_kept: list[Notice] = []
+# None outside of a command: complaints are Python warnings there.
+_kept: list[Notice] | None = None
 
 
 class _Keeper(logging.Handler):
     """Keeps what a decoder logs."""
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Keep a message, each once."""
+        """Keep a message, each once, or warn of it."""
         path = reading.get()
         notice = Notice(
             "decoder-complains",
@@ -45,7 +48,9 @@ class _Keeper(logging.Handler):
             f"the decoder says: {record.getMessage().splitlines()[0]}",
             "compare the file with the camera's; --verify SHA256SUMS does",
         )
-        if len(_kept) < MOST_KEPT and notice not in _kept:
+        if _kept is None:
+            warnings.warn(LfpivWarning(notice), stacklevel=2)
+        elif len(_kept) < MOST_KEPT and notice not in _kept:
             _kept.append(notice)
 
 
@@ -55,10 +60,16 @@ _logger.addHandler(_Keeper(logging.WARNING))
 _logger.propagate = False
 
 
-def taken_complaints() -> list[Notice]:
-    """Return what was complained of since the last time."""
-    taken, _kept[:] = list(_kept), []
-    return taken
+@contextmanager
+def complaints_kept() -> Iterator[list[Notice]]:
+    """Hold a list of what is complained of meanwhile."""
+    global _kept
+    kept: list[Notice] = []
+    _kept = kept
+    try:
+        yield kept
+    finally:
+        _kept = None
 
 
 Image = NDArray[np.float32]
