@@ -31,8 +31,8 @@ import tifffile
 
 from lfpiv_cli.cli.main import cli
 from lfpiv_cli.console import Console, Frames
+from lfpiv_cli.files.batch import expanded
 from lfpiv_cli.files.images import read_image
-from lfpiv_cli.files.listing import expanded
 from lfpiv_cli.verbs.batches import Batch, BatchOptions, work_through
 from lfpiv_cli.verbs.correlate import CorrelateOptions, Correlation
 from lfpiv_cli.verbs.reconstruct import Reconstruction, ReconstructOptions

@@ -9,9 +9,9 @@ import pytest
 import tifffile
 
 from lfpiv_cli.errors import InputError, PartialError, StoppedEarlyError, UsageError
-from lfpiv_cli.files import listing
+from lfpiv_cli.files import batch
 from lfpiv_cli.files.images import read_image
-from lfpiv_cli.files.shares import Deadline
+from lfpiv_cli.files.inputs import Deadline
 from tests.commands import CONFIG, SAMPLE, run
 from tests.test_particle_stage import write_frame
 
@@ -183,7 +183,7 @@ def test_frames_that_come(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     camera = Filling(tmp_path / "run", {1.0: frames[0], 2.0: frames[1], 14.0: frames[2]})
-    monkeypatch.setattr(listing, "time", camera)
+    monkeypatch.setattr(batch, "time", camera)
     alone(weights, [camera.folder], tmp_path / "v", "--watch", "--idle-s", 20, "--json")
     told = json.loads(capsys.readouterr().out)
     assert (told["frames"], told["reconstructed"]) == (3, 3)
@@ -206,7 +206,7 @@ def test_pairs_that_come(pairing: str, volumes: list[Path], tmp_path: Path, monk
         path.write_bytes(volume.read_bytes())
     common = ("--pairing", pairing, "--windows", "4", "--quiet")
     folder = Filling(tmp_path / "volumes", dict(zip((1.0, 5.9, 6.0, 14.0), named, strict=True)))
-    monkeypatch.setattr(listing, "time", folder)
+    monkeypatch.setattr(batch, "time", folder)
     run("correlate", folder.folder, *common, "--watch", "--idle-s", 20, "-o", tmp_path / "v")
     run("correlate", *named, *common, "-o", tmp_path / "one")
     assert len(bytes_of(tmp_path / "one")) == (2 if pairing == "ab" else 3)
@@ -221,7 +221,7 @@ def test_a_lost_frame_of_a_folder_that_is_being_filled_is_told_at_once(
     for path, volume in zip(named, volumes, strict=True):
         path.write_bytes(volume.read_bytes())
     folder = Filling(tmp_path / "volumes", dict(zip((1.0, 1.5, 2.0, 9.0, 10.0), named, strict=True)))
-    monkeypatch.setattr(listing, "time", folder)
+    monkeypatch.setattr(batch, "time", folder)
     with pytest.raises(PartialError, match="1 of 3 pairs failed, the first because the second frame of its pair"):
         run("correlate", folder.folder, "--pair-by", "{pair}{frame}", "--windows", 4, "--watch", "-o", tmp_path / "v")
     assert sorted(bytes_of(tmp_path / "v")) == ["1a.vtkhdf", "3a.vtkhdf"]
@@ -230,11 +230,11 @@ def test_a_lost_frame_of_a_folder_that_is_being_filled_is_told_at_once(
 
 def test_what_stays_away(volumes: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, weights: Path) -> None:
     folder = Filling(tmp_path / "volumes", {1.0: volumes[0]})
-    monkeypatch.setattr(listing, "time", folder)
+    monkeypatch.setattr(batch, "time", folder)
     with pytest.raises(InputError, match="no other frame has come"):
         run("correlate", folder.folder, "--pairing", "ab", "--watch", "--idle-s", 5, "-o", tmp_path / "v")
     camera = Filling(tmp_path / "run", {})
-    monkeypatch.setattr(listing, "time", camera)
+    monkeypatch.setattr(batch, "time", camera)
     with pytest.raises(InputError, match="no images have come in 5 s"):
         alone(weights, [camera.folder], tmp_path / "v", "--watch", "--idle-s", 5)
 

@@ -18,10 +18,9 @@ import tifffile
 
 from lfpiv_cli.cli.options import Terminated
 from lfpiv_cli.errors import InputError, OutputError, OutputExistsError, PartialError, UsageError
-from lfpiv_cli.files import atomic, shares
-from lfpiv_cli.files.atomic import EventLog, ignores_case
+from lfpiv_cli.files import atomic
+from lfpiv_cli.files.atomic import DEAD_AFTER_S, EventLog, claim_path, claimed, ignores_case
 from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, read_points
-from lfpiv_cli.files.shares import DEAD_AFTER_S, claim_path, claimed
 from lfpiv_cli.files.vtkhdf import open_volume, write_volume
 from lfpiv_cli.grid import Grid, Reference
 from lfpiv_cli.verbs import reconstruct as stage
@@ -239,7 +238,7 @@ def test_a_living_worker_is_respected_and_shows_that_it_is_alive(tmp_path, monke
             assert not granted
         assert claim.exists()
     # A worker shows that it is alive.
-    monkeypatch.setattr(shares, "TOUCHED_EVERY_S", 0.01)
+    monkeypatch.setattr(atomic, "TOUCHED_EVERY_S", 0.01)
     with claimed(tmp_path / "x.vtkhdf") as granted:
         assert granted
         claim = claim_path(tmp_path / "x.vtkhdf")

@@ -16,8 +16,9 @@ import pytest
 
 from lfpiv_cli.console import Console, Frames
 from lfpiv_cli.errors import InputError, OutputError, PartialError, StoppedEarlyError, UsageError
+from lfpiv_cli.files.atomic import claimed
 from lfpiv_cli.files.batch import Target
-from lfpiv_cli.files.shares import Shard, claimed
+from lfpiv_cli.files.inputs import Shard
 from lfpiv_cli.notice import Notice
 from lfpiv_cli.verbs.batches import Batch, BatchOptions, Worked, work_through
 
@@ -191,3 +192,20 @@ def test_workers_elsewhere_and_a_scheduler_that_ends(tmp_path: Path) -> None:
         (tmp_path / "scheduler").write_text(str(scheduler))
         with pytest.raises(StoppedEarlyError, match="the scheduler has ended; the same command with --resume goes on"):
             work(Ending(tmp_path, 2), address)
+
+
+def test_workers_go_on_where_they_are_and_begin_where_most_is_left() -> None:
+    from lfpiv_cli.verbs.distributed import Runs
+
+    left = Runs([10, 11, 12, 13, 14, 15, 16, 17])
+    assert [left.next_for(worker) for worker in "ab"] == [10, 14]
+    assert [left.next_for(worker) for worker in "aab"] == [11, 12, 15]
+    # a third worker takes the second half of the longest run, a worker without one the rest of another's
+    assert [left.next_for(worker) for worker in "caa"] == [17, 13, 16]
+    assert not left
+    left = Runs(range(5))
+    assert [left.next_for("a") for _ in range(len(left))] == list(range(5))
+    left = Runs([5, 6])
+    assert left.next_for("a") == 5
+    left.put_back(5)
+    assert sorted([left.next_for("b"), left.next_for("c")]) == [5, 6]

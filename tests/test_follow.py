@@ -14,8 +14,8 @@ from lfpiv_cli.arrays import Floats
 from lfpiv_cli.errors import InputError, OutputExistsError, PartialError, StoppedEarlyError, UsageError
 from lfpiv_cli.files.batch import Frame
 from lfpiv_cli.files.images import write_tiff
+from lfpiv_cli.files.inputs import Deadline
 from lfpiv_cli.files.particle_file import TRAJECTORIES_FORMAT, Points, read_points
-from lfpiv_cli.files.shares import Deadline
 from lfpiv_cli.particles.view import raw_view
 from lfpiv_cli.verbs import follow as stage
 from tests.commands import run, sample_weights

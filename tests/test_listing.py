@@ -11,11 +11,10 @@ import numpy as np
 import pytest
 
 from lfpiv_cli.errors import InputError, UsageError
-from lfpiv_cli.files import listing
+from lfpiv_cli.files import batch
 from lfpiv_cli.files.atomic import write_json
-from lfpiv_cli.files.batch import Frame, images_seen, results_seen
+from lfpiv_cli.files.batch import Frame, expanded, files_in, images_seen, results_seen
 from lfpiv_cli.files.hdf5 import write_header
-from lfpiv_cli.files.listing import expanded, files_in
 from lfpiv_cli.verbs import particles
 from lfpiv_cli.verbs.pairs import PairOptions, found_pairs
 from tests.commands import run
@@ -35,9 +34,9 @@ def test_a_list_names_a_file_a_line(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     (tmp_path / "a b.tif").touch()
     monkeypatch.chdir(tmp_path)
     expected = [Path("a b.tif"), Path("odd\udcff.tif"), Path("/x/c.tif")]
-    assert listing.listed(tmp_path / "list") == expected
+    assert batch.listed(tmp_path / "list") == expected
     monkeypatch.setattr("sys.stdin", SimpleNamespace(buffer=io.BytesIO(content)))
-    assert listing.listed(Path("-")) == expected
+    assert batch.listed(Path("-")) == expected
     (tmp_path / "list").write_bytes(b"II*\0\0")
     (tmp_path / "rig.yaml").write_bytes(b"camera:\n  magnification: -1\n")
     no_lists = (
@@ -46,7 +45,7 @@ def test_a_list_names_a_file_a_line(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     )
     for path, said in (*no_lists, (tmp_path / "none", "no such file"), (tmp_path, "a folder")):
         with pytest.raises(InputError, match=said):
-            listing.listed(path)
+            batch.listed(path)
 
 
 def test_a_folder_stands_for_its_files_of_a_kind(tmp_path: Path) -> None:

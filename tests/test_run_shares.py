@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 
 from lfpiv_cli.errors import StoppedEarlyError, UsageError
-from lfpiv_cli.files import shares
-from lfpiv_cli.files.shares import Deadline
+from lfpiv_cli.files import atomic
+from lfpiv_cli.files.inputs import Deadline
 from lfpiv_cli.verbs import run_steps
 from tests.commands import run as lfpiv
 from tests.test_run import PAIR, PHOTOGRAPHS, rig_in
@@ -93,15 +93,15 @@ def test_workers_give_one_command_s_files(rig: Path, whole: Path, with_weights: 
 def test_weights_and_volumes_that_another_worker_makes_are_waited_for(
     rig: Path, whole: Path, with_weights: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(shares, "SECONDS_BETWEEN_LOOKS", 0.05)
-    waiting, sleep = threading.Event(), shares.time.sleep
-    monkeypatch.setattr(shares.time, "sleep", lambda seconds: (waiting.set(), sleep(seconds)))
+    monkeypatch.setattr(atomic, "SECONDS_BETWEEN_LOOKS", 0.05)
+    waiting, sleep = threading.Event(), atomic.time.sleep
+    monkeypatch.setattr(atomic.time, "sleep", lambda seconds: (waiting.set(), sleep(seconds)))
     weights, shared = with_weights / "weights.h5", with_weights / "volumes" / "f0.vtkhdf"
     moved = weights.rename(with_weights.parent / "weights.h5")
     shared.parent.mkdir()
     for path, options in ((weights, ("--shard", "1/3")), (shared, ("--shard", "1/2", "--keep", "results"))):
         waiting.clear()
-        other = shares.claimed(path)
+        other = atomic.claimed(path)
         assert other.__enter__()
         images = "images" if path == weights else "in_time"
         worker = threading.Thread(target=run, args=(rig, with_weights, *options), kwargs={"images": images})
@@ -206,7 +206,7 @@ def test_volumes_that_another_worker_needs_stay(rig: Path, with_weights: Path) -
 
 @pytest.mark.thorough
 def test_the_folder_of_volumes_may_go(rig: Path, with_weights: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    create, removed = shares.create_alone, []
+    create, removed = atomic.create_alone, []
 
     def created(path: Path) -> int:
         if path.parent.name == "volumes" and not removed:
@@ -214,6 +214,6 @@ def test_the_folder_of_volumes_may_go(rig: Path, with_weights: Path, monkeypatch
             removed.append(True)
         return create(path)
 
-    monkeypatch.setattr(shares, "create_alone", created)
+    monkeypatch.setattr(atomic, "create_alone", created)
     run(rig, with_weights, "--shard", "1/2", "--keep", "results", images="in_time")
     assert (with_weights / "vectors" / "f0.vtkhdf").exists()

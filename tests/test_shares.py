@@ -9,9 +9,9 @@ import pytest
 
 from lfpiv_cli.arrays import Floats
 from lfpiv_cli.errors import InputError, UsageError
-from lfpiv_cli.files import listing, shares
-from lfpiv_cli.files.listing import LOOK_S, PASSED_OVER_S, SETTLED_S, as_they_come
-from lfpiv_cli.files.shares import Deadline, Runs, Shard, parse_time_limit
+from lfpiv_cli.files import batch, inputs
+from lfpiv_cli.files.batch import LOOK_S, PASSED_OVER_S, SETTLED_S, as_they_come
+from lfpiv_cli.files.inputs import Deadline, Shard, parse_time_limit
 from lfpiv_cli.threads import blocks, in_threads, share_out
 
 
@@ -61,7 +61,7 @@ def test_times_as_people_and_slurm_write_them() -> None:
 
 def test_a_frame_that_would_not_be_done_is_not_begun(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = [0.0]
-    monkeypatch.setattr(shares.time, "monotonic", lambda: clock[0])
+    monkeypatch.setattr(inputs.time, "monotonic", lambda: clock[0])
     deadline = Deadline(100.0, begun=0.0)
     assert deadline.leaves_time()
     deadline.took(40.0)
@@ -76,21 +76,6 @@ def test_a_frame_that_would_not_be_done_is_not_begun(monkeypatch: pytest.MonkeyP
     assert "2 of 5 frames are done; the same command with --resume goes on" in str(told)
     assert told.exit_code == 75
     assert Deadline(None, longest_s=1e9, begun=-1e9).leaves_time()
-
-
-def test_workers_go_on_where_they_are_and_begin_where_most_is_left() -> None:
-    left = Runs([10, 11, 12, 13, 14, 15, 16, 17])
-    assert [left.next_for(worker) for worker in "ab"] == [10, 14]
-    assert [left.next_for(worker) for worker in "aab"] == [11, 12, 15]
-    # a third worker takes the second half of the longest run, a worker without one the rest of another's
-    assert [left.next_for(worker) for worker in "caa"] == [17, 13, 16]
-    assert not left
-    left = Runs(range(5))
-    assert [left.next_for("a") for _ in range(len(left))] == list(range(5))
-    left = Runs([5, 6])
-    assert left.next_for("a") == 5
-    left.put_back(5)
-    assert sorted([left.next_for("b"), left.next_for("c")]) == [5, 6]
 
 
 WHOLE = b"a whole image"
@@ -133,7 +118,7 @@ def read(path: Path) -> None:
 @pytest.fixture
 def recorder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Recorder:
     recorder = Recorder(tmp_path)
-    monkeypatch.setattr(listing, "time", recorder)
+    monkeypatch.setattr(batch, "time", recorder)
     return recorder
 
 

@@ -17,7 +17,7 @@ import tifffile
 
 from lfpiv_cli.console import Console
 from lfpiv_cli.errors import ConfigError, InputError, PartialError
-from lfpiv_cli.files import listing
+from lfpiv_cli.files import batch
 from lfpiv_cli.files.batch import Frame, images_seen
 from lfpiv_cli.files.config import load_rig
 from lfpiv_cli.files.vtkhdf import write_vectors
@@ -109,7 +109,7 @@ def test_files_are_those_of_run_and_what_is_lost_or_broken_is_told_and_passed_ov
     (broken,) = named(tmp_path / "source", "4b", whole=False)
     plan = dict(zip((1.0, 2.0, 4.0, 6.0, 7.0, 9.0, 30.0, 31.0), source, strict=True)) | {10.0: broken}
     camera = Filling(tmp_path / "images", plan)
-    monkeypatch.setattr(listing, "time", camera)
+    monkeypatch.setattr(batch, "time", camera)
     with pytest.raises(PartialError, match="2 frames or pairs failed") as caught:
         watch(rig, camera.folder, tmp_path / "out", "--idle-s", 20)
     captured = capsys.readouterr()
@@ -140,7 +140,7 @@ def test_a_first_pair_that_cannot_be_measured_is_told_and_the_next_one_is(
     for path in source[:2]:
         tifffile.imwrite(path, np.arange(30, dtype=np.uint16).reshape(5, 6))
     camera = Filling(tmp_path / "images", dict(zip((1.0, 2.0, 8.0, 9.0), source, strict=True)))
-    monkeypatch.setattr(listing, "time", camera)
+    monkeypatch.setattr(batch, "time", camera)
     with pytest.raises(PartialError, match="1a"):
         watch(rig, camera.folder, tmp_path / "out", "--idle-s", 6)
     lines = [line for line in capsys.readouterr().out.splitlines() if re.match(r"\d[ab]", line)]
@@ -245,7 +245,7 @@ def test_particles_are_those_of_run_and_pairs_wait_until_the_tracers_size_is_kno
     how = (*photographs, "--method", "particles", "--no-report")
     lfpiv("run", config, images, "--pairing", "ab", *how, "-q", "-o", tmp_path / "one")
     camera = Filling(tmp_path / "camera", dict(enumerate(sorted(images.iterdir()), start=1)))
-    monkeypatch.setattr(listing, "time", camera)
+    monkeypatch.setattr(batch, "time", camera)
     seen: list[int] = []
     known = particles.size_of
 
@@ -271,6 +271,6 @@ def test_a_watch_without_a_time_between_frames_is_refused_at_once(tmp_path: Path
 @pytest.mark.thorough
 def test_images_without_a_pair_are_told_at_the_end(rig: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     camera = Filling(tmp_path / "images", dict(enumerate(named(tmp_path / "source", "1a", "2a"), start=1)))
-    monkeypatch.setattr(listing, "time", camera)
+    monkeypatch.setattr(batch, "time", camera)
     with pytest.raises(InputError, match=r"1a.tif: the second frame of its pair is missing"):
         watch(rig, camera.folder, tmp_path / "out", "--idle-s", 5)

@@ -18,7 +18,7 @@ from lfpiv_cli.reconstruction.registry import SolverName
 
 def particles_in(_context: click.Context, _option: click.Parameter, folder: Path | None) -> tuple[Path, ...] | None:
     """Return the files of particles in a folder, if it is given."""
-    from lfpiv_cli.files.listing import expanded
+    from lfpiv_cli.files.batch import expanded
 
     return None if folder is None else tuple(expanded([folder], "results"))
 

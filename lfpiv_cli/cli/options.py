@@ -17,8 +17,7 @@ from lfpiv_cli import __version__
 from lfpiv_cli.errors import LfpivError, LimitMissedError, OutputError, PartialError, UsageError
 from lfpiv_cli.files import kernel_cache
 from lfpiv_cli.files.atomic import shown, without_nan
-from lfpiv_cli.files.inputs import reason
-from lfpiv_cli.files.shares import Shard, parse_time_limit
+from lfpiv_cli.files.inputs import Shard, parse_time_limit, reason
 from lfpiv_cli.names import InputKind, Pairing, names_in
 
 if TYPE_CHECKING:
@@ -176,7 +175,7 @@ def inputs_argument(name: str, kind: InputKind = "images") -> Callable[..., Any]
         @option("--files-from", FILE, f"List of more {name}, a file or folder a line; - for stdin.")
         @wraps(command)
         def run(files_from: Path | None = None, **arguments: Any) -> Any:
-            from lfpiv_cli.files.listing import expanded, listed
+            from lfpiv_cli.files.batch import expanded, listed
 
             if arguments.get("watch"):
                 if files_from is not None:
@@ -368,7 +367,7 @@ def common_options(command: Callable[..., dict[str, Any]]) -> Callable[..., None
         try:
             given = {name: value for name, value in arguments.items() if value is not None}
             if verify is not None:
-                from lfpiv_cli.files.listing import ensure_verified
+                from lfpiv_cli.files.batch import ensure_verified
 
                 # All that it reads; a text may name a file, too.
                 read = _flat(value for name, value in given.items() if name not in OUTPUTS)

@@ -1,4 +1,4 @@
-"""What every reader asks of a file before it opens it, and every command of the memory before it begins."""
+"""What every reader asks of a file, and every command of memory and disk, before it begins; its share, and its time."""
 
 from __future__ import annotations
 
@@ -6,12 +6,14 @@ import os
 import re
 import shutil
 import stat
-from collections.abc import Iterator
+import time
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 from io import BufferedReader
 from pathlib import Path
 
-from lfpiv_cli.errors import InputError, OutputError
+from lfpiv_cli.errors import InputError, OutputError, StoppedEarlyError, UsageError
 
 # Where the system does not tell its memory (Windows), files that declare more than this are refused.
 MEMORY_WHERE_UNKNOWN = 16 * 1024**3
@@ -206,3 +208,128 @@ def _text(path: Path) -> str:
 
 def _gb(size: float) -> str:
     return f"{size / GB:.2f}"
+
+
+# Shares of a batch: the frames that one job of many does, and in what time.
+#
+# A share is a run of frames that follow each other, not every n-th one: pairs and the frames that a background is made
+# from then lie in one share, but for its ends, and are read and searched once. It is a share of all frames, whatever
+# is complete already: so each job's share stays the same when it is started again.
+
+# In place of i/n: what Slurm tells each job of an array.
+SLURM = "slurm"
+SECONDS = {"": 1.0, "s": 1.0, "m": 60.0, "h": 3600.0, "d": 86400.0}
+# A share that has no end would be a loop in somebody's script.
+MOST_SHARES = 1_000_000
+
+
+@dataclass(frozen=True)
+class Shard:
+    """Part `number` of `count` parts of a batch, counted from 1."""
+
+    number: int = 1
+    count: int = 1
+
+    @classmethod
+    def parse(cls, text: str, environment: Mapping[str, str] = os.environ) -> Shard:
+        """Return the share that is written as `2/3`, or as `slurm`: the one of this job in its array.
+
+        Raises
+        ------
+        UsageError : it is neither, or Slurm's array is not a run of numbers at equal steps.
+        """
+        if text == SLURM:
+            task, first, count = (_slurms(environment, name) for name in ("ID", "MIN", "COUNT"))
+            step = _slurms(environment, "STEP", 1)
+            place, beside = divmod(task - first, max(step, 1))
+            if beside or not 0 <= place < count:
+                raise UsageError(
+                    f"--shard {SLURM}: task {task} is none of {count} that begin at {first} in steps of {step}; give "
+                    "a range, as --array=1-20"
+                )
+            return cls(place + 1, count)
+        found = re.fullmatch(r"(\d{1,7})/(\d{1,7})", text, re.ASCII)
+        if found is None:
+            raise UsageError(f"--shard {text}: is neither i/n, as 2/3, nor {SLURM}")
+        number, count = int(found[1]), int(found[2])
+        if not 1 <= number <= count <= MOST_SHARES:
+            raise UsageError(f"--shard {text}: i goes from 1 to n, and n to {MOST_SHARES}")
+        return cls(number, count)
+
+    @property
+    def is_last(self) -> bool:
+        """True of the last part."""
+        return self.number == self.count
+
+    def numbers(self, total: int) -> range:
+        """Return the numbers of the frames of this share, of `total` frames counted from 0."""
+        return range((self.number - 1) * total // self.count, self.number * total // self.count)
+
+    def of(self, order: Sequence[int]) -> Sequence[int]:
+        """Return those of this share, of the numbers of frames in the order in which they are divided."""
+        places = self.numbers(len(order))
+        return order[places.start : places.stop]
+
+
+def _slurms(environment: Mapping[str, str], name: str, default: int | None = None) -> int:
+    """Return what Slurm tells a job of its array."""
+    variable = f"SLURM_ARRAY_TASK_{name}"
+    text = environment.get(variable, "" if default is None else str(default))
+    if not re.fullmatch(r"\d{1,9}", text, re.ASCII):
+        raise UsageError(f"--shard {SLURM}: {variable} is {text or 'not set'}; sbatch --array sets it to a number")
+    return int(text)
+
+
+def parse_time_limit(text: str) -> float:
+    """Return the seconds of a time as `3600`, `50m`, `1.5h`, or as Slurm writes it: `00:50:00`, `1-12:00:00`.
+
+    Raises
+    ------
+    UsageError : it is none of these, or no time at all.
+    """
+    clock = re.fullmatch(r"(?:(\d{1,3})-)?(\d{1,3}):([0-5]\d):([0-5]\d)", text, re.ASCII)
+    number = re.fullmatch(r"(\d{1,9}(?:\.\d{1,9})?)([smhd]?)", text, re.ASCII)
+    if clock is not None:
+        days, hours, minutes, seconds = (int(part or 0) for part in clock.groups())
+        limit = 86400.0 * days + 3600.0 * hours + 60.0 * minutes + seconds
+    elif number is not None:
+        limit = float(number[1]) * SECONDS[number[2]]
+    else:
+        raise UsageError(f"--time-limit {text}: is no time, as 3600, 50m, 1.5h or 00:50:00")
+    if limit == 0.0:
+        raise UsageError(f"--time-limit {text}: leaves no time at all")
+    return limit
+
+
+@dataclass
+class Deadline:
+    """When a command has to be done, and how long a frame of it takes at most; begins when it is made.
+
+    Attributes
+    ----------
+    limit_s : seconds from its begin, None for no limit
+    longest_s : what the longest frame so far took
+    """
+
+    limit_s: float | None = None
+    longest_s: float = 0.0
+    begun: float = field(default_factory=time.monotonic)
+
+    def took(self, seconds: float) -> None:
+        """Remember the longest frame: by it the next one is judged."""
+        self.longest_s = max(self.longest_s, seconds)
+
+    def leaves_time(self, frames: int = 1) -> bool:
+        """Return whether so many frames, each as long as the longest one so far, would be done in time."""
+        return self.limit_s is None or self._left_s() > frames * self.longest_s
+
+    def error(self, done: int, total: int, unit: str) -> StoppedEarlyError:
+        """Return the error of a batch that stops for lack of time."""
+        return StoppedEarlyError(
+            f"stopped before the time limit of {self.limit_s:g} s: {max(self._left_s(), 0.0):.0f} s are left, and a "
+            f"{unit} took up to {self.longest_s:.1f} s; {done} of {total} {unit}s are done; the same command with "
+            "--resume goes on"
+        )
+
+    def _left_s(self) -> float:
+        return (self.limit_s or 0.0) - (time.monotonic() - self.begun)

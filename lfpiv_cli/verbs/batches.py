@@ -12,10 +12,9 @@ from __future__ import annotations
 import json
 import shutil
 import time
-from collections.abc import Callable, Generator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass, field
-from enum import Enum, auto
 from functools import partial
 from pathlib import Path
 from statistics import median
@@ -23,10 +22,9 @@ from typing import Any, Generic, Self, TypeVar
 
 from lfpiv_cli.console import Console, Frames
 from lfpiv_cli.errors import InputError, PartialError, UsageError
-from lfpiv_cli.files.atomic import ensure_apart, ensure_writable, write_text
+from lfpiv_cli.files.atomic import SECONDS_BETWEEN_LOOKS, Turn, claimed, ensure_apart, ensure_writable, write_text
 from lfpiv_cli.files.batch import Stamp, State, Target, pending, stamp_of, state_of
-from lfpiv_cli.files.inputs import PROGRAM_BYTES
-from lfpiv_cli.files.shares import SECONDS_BETWEEN_LOOKS, Deadline, Shard, claimed
+from lfpiv_cli.files.inputs import PROGRAM_BYTES, Deadline, Shard
 from lfpiv_cli.notice import Notice
 
 Made = TypeVar("Made", covariant=True)
@@ -35,15 +33,7 @@ AT_MOST = "at most, uncompressed"
 # What a file has besides its arrays: its record and those of its inputs, attributes, and space that HDF5 leaves free.
 RECORD_BYTES = 100e3
 
-
 ALL = Shard(1, 1)
-
-
-class Turn(Enum):
-    """What keeps an output from being made: another worker makes it now, or has made it since the batch began."""
-
-    CLAIMED = auto()
-    SKIPPED = auto()
 
 
 # The numbers of outputs with what became of each, as it is known.
@@ -188,6 +178,24 @@ class Batch(Generic[Made]):
         """
         raise NotImplementedError
 
+    def attempt(self, number: int, before: Stamp, work: Frames) -> Made | Turn:
+        """Make an output, unless another worker does or did; `before` is what was in its place when the batch began.
+
+        Raises
+        ------
+        InputError : as `make`
+        """
+        target = self.targets[number]
+        with claimed(target.path) as granted:
+            if not granted:
+                return Turn.CLAIMED
+            if stamp_of(target.path) != before and state_of(target) is State.COMPLETE:
+                return Turn.SKIPPED
+            return self.make(number, work)
+
+    def end(self, worked: Worked[Made], console: Console) -> None:
+        """Make what is made of all outputs together, once these are there."""
+
     def summary(self, worked: Worked[Made]) -> dict[str, Any]:
         """Return what is reported of what became of it."""
         return {}
@@ -240,9 +248,11 @@ def carried_out(batch: Batch[Made], options: BatchOptions, console: Console) -> 
     LfpivError : as `work_through`
     PartialError : outputs could not be made, and the others were
     """
+    share, before = _left_of(batch, options, console)
     if options.dry_run:
-        return dry_run(batch, options, console)
-    worked = work_through(batch, options, console)
+        return _planned(batch, share, before, console)
+    worked = _made(batch, share, before, options, console)
+    batch.end(worked, console)
     return worked.ensure_whole(batch.summary(worked), batch.unit)
 
 
@@ -255,29 +265,39 @@ def work_through(batch: Batch[Made], options: BatchOptions, console: Console) ->
     InputError : an input cannot be read, and the batch is not to go on without it
     StoppedEarlyError : the time is over
     """
-    share = _share(batch, options, console)
-    if options.failures is not None:
-        ensure_writable(options.failures, batch.overwrite or options.resume)
-    targets = [batch.targets[number] for number in share]
-    left = [share[k] for k in pending(targets, (), batch.overwrite, options.resume)]
-    worked: Worked[Made] = Worked(skipped=len(share) - len(left))
-    before = {number: stamp_of(batch.targets[number].path) for number in left}
+    return _made(batch, *_left_of(batch, options, console), options, console)
+
+
+def _made(
+    batch: Batch[Made], share: Sequence[int], before: Mapping[int, Stamp], options: BatchOptions, console: Console
+) -> Worked[Made]:
+    """Make those outputs of a share that are left, and note what became of each."""
+    left, worked = list(before), Worked[Made](skipped=len(share) - len(before))
     console.warn(batch.notices)
-    deadline = options.deadline()
+    deadline, made_by = options.deadline(), _made_here if options.dask is None else _workers(options.dask)
     steps = batch.begin(left, console) if options.dask is None else 1.0
-    with console.frames(len(left), steps, batch.label, batch.unit) as work:
-        if options.dask is None:
-            attempts = _made_here(batch, before, deadline, work)
-        else:
-            try:
-                from lfpiv_cli.verbs.distributed import made_by_workers
-            except ImportError as error:
-                raise UsageError(f'--dask needs distributed: pip install "lfpiv[cluster]" ({error})') from error
-            attempts = made_by_workers(batch, before, options.dask, deadline, work.console)
-        # Closed at once where one fails: workers are let go.
-        with closing(attempts):
-            for number, made in attempts:
-                _settle(batch, number, made, options.keep_going, work, worked)
+    # Closed at once where one fails: workers are let go.
+    with (
+        console.frames(len(left), steps, batch.label, batch.unit) as work,
+        closing(made_by(batch, before, deadline, work)) as attempts,
+    ):
+        for number, made in attempts:
+            name = batch.names[number]
+            if isinstance(made, InputError):
+                if not options.keep_going:
+                    names = [batch.names[k] for k in worked.outcomes]
+                    if not names:
+                        raise InputError(str(made)) from made
+                    reported = names[0] if len(names) == 1 else f"{names[0]} to {names[-1]}"
+                    written = f"{len(names)} of {len(batch.targets)} {batch.unit}s were written before"
+                    raise InputError(f"{made}; {written}: {reported}") from made
+                worked.failures.append(Failure(name, str(made)))
+                console.warn([Notice("frame-failed", name, str(made), "leave it out, or mend it")])
+            elif isinstance(made, Turn):
+                worked.skipped += 1
+            else:
+                worked.outcomes[number] = made
+            work.done(name)
     worked.outcomes = dict(sorted(worked.outcomes.items()))
     done = worked.total()
     if options.shard.number == 1:
@@ -289,26 +309,24 @@ def work_through(batch: Batch[Made], options: BatchOptions, console: Console) ->
     return worked
 
 
-def _share(batch: Batch[Any], options: WorkOptions, console: Console) -> Sequence[int]:
-    """Return the numbers of the outputs that are this worker's, none of whose files is an input."""
+def _left_of(batch: Batch[Any], options: BatchOptions, console: Console) -> tuple[Sequence[int], dict[int, Stamp]]:
+    """Return the numbers of this worker's outputs, none an input; and of those left, with what is in their places."""
     ensure_apart([*batch.outputs, *filter(None, (options.failures, console.log_file))], batch.inputs)
-    return options.shard.of(batch.order)
+    if options.failures is not None and not options.dry_run:
+        ensure_writable(options.failures, batch.overwrite or options.resume)
+    share = options.shard.of(batch.order)
+    targets = [batch.targets[number] for number in share]
+    left = pending(targets, (), batch.overwrite, options.resume, dry=options.dry_run)
+    return share, {share[k]: stamp_of(targets[k].path) for k in left}
 
 
-def attempt(batch: Batch[Made], number: int, before: Stamp, work: Frames) -> Made | Turn:
-    """Make an output, unless another worker does or did; `before` is what was in its place when the batch began.
-
-    Raises
-    ------
-    InputError : as `Batch.make`
-    """
-    target = batch.targets[number]
-    with claimed(target.path) as granted:
-        if not granted:
-            return Turn.CLAIMED
-        if stamp_of(target.path) != before and state_of(target) is State.COMPLETE:
-            return Turn.SKIPPED
-        return batch.make(number, work)
+def _workers(address: str) -> Callable[..., Attempts[Any]]:
+    """Return what has outputs made by the workers of a scheduler (UsageError: Dask is not installed)."""
+    try:
+        from lfpiv_cli.verbs.distributed import made_by_workers
+    except ImportError as error:
+        raise UsageError(f'--dask needs distributed: pip install "lfpiv[cluster]" ({error})') from error
+    return partial(made_by_workers, address)
 
 
 def _made_here(batch: Batch[Made], before: Mapping[int, Stamp], deadline: Deadline, work: Frames) -> Attempts[Made]:
@@ -322,7 +340,7 @@ def _made_here(batch: Batch[Made], before: Mapping[int, Stamp], deadline: Deadli
             begun = time.monotonic()
             made: Made | Turn | InputError
             try:
-                made = attempt(batch, number, before[number], work)
+                made = batch.attempt(number, before[number], work)
             except InputError as error:
                 made = error
             if made is Turn.CLAIMED:
@@ -335,38 +353,8 @@ def _made_here(batch: Batch[Made], before: Mapping[int, Stamp], deadline: Deadli
         left = of_others
 
 
-def _settle(
-    batch: Batch[Made],
-    number: int,
-    made: Made | Turn | InputError,
-    keep_going: bool,
-    work: Frames,
-    worked: Worked[Made],
-) -> None:
-    """Note what became of an output (InputError: it could not be made, and the batch is not to go on without it)."""
-    name = batch.names[number]
-    if isinstance(made, InputError):
-        if not keep_going:
-            names = [batch.names[k] for k in worked.outcomes]
-            if not names:
-                raise InputError(str(made)) from made
-            reported = names[0] if len(names) == 1 else f"{names[0]} to {names[-1]}"
-            written = f"{len(names)} of {len(batch.targets)} {batch.unit}s were written before"
-            raise InputError(f"{made}; {written}: {reported}") from made
-        worked.failures.append(Failure(name, str(made)))
-        work.console.warn([Notice("frame-failed", name, str(made), "leave it out, or mend it")])
-    elif isinstance(made, Turn):
-        worked.skipped += 1
-    else:
-        worked.outcomes[number] = made
-    work.done(name)
-
-
-def dry_run(batch: Batch[Any], options: WorkOptions, console: Console) -> dict[str, Any]:
-    """Return what a batch would make, and what that takes; write nothing (LfpivError: the batch would not begin)."""
-    share = _share(batch, options, console)
-    targets = [batch.targets[number] for number in share]
-    needed = [share[k] for k in pending(targets, (), batch.overwrite, options.resume, dry=True)]
+def _planned(batch: Batch[Any], share: Sequence[int], needed: Iterable[int], console: Console) -> dict[str, Any]:
+    """Return what a batch would make, and what that takes; write nothing."""
     faults = {number: fault for number in needed if (fault := batch.fault(number)) is not None}
     making, skipped = [number for number in needed if number not in faults], sorted(set(share) - set(needed))
     for number in making:

@@ -14,8 +14,8 @@ import numpy as np
 
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.files import calibration_file, weights_file
+from lfpiv_cli.files.batch import natural
 from lfpiv_cli.files.hdf5 import open_h5, read_provenance
-from lfpiv_cli.files.listing import natural
 from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, TRACKS_FORMAT, TRAJECTORIES_FORMAT
 from lfpiv_cli.files.vtkhdf import VECTORS_FORMAT, VOLUME_FORMAT
 from lfpiv_cli.flow.field import VectorField

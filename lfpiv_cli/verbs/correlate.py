@@ -32,11 +32,11 @@ from lfpiv_cli.flow.windows import inside
 from lfpiv_cli.grid import FOCAL_POINT, Grid
 from lfpiv_cli.notice import warn_of
 from lfpiv_cli.verbs import checks
-from lfpiv_cli.verbs.batches import ALL, BatchOptions, Expected, Failure, Worked, dry_run, work_through
+from lfpiv_cli.verbs.batches import ALL, BatchOptions, Expected, Failure, Worked, carried_out, work_through
 from lfpiv_cli.verbs.fields import arrays_of
 from lfpiv_cli.verbs.frames import dt_notices
 from lfpiv_cli.verbs.pairs import PairBatch, PairBatchOptions, coming_pairs, watched, work_as_they_come
-from lfpiv_cli.verbs.statistics import Mean, are_measured, mean_of_measured
+from lfpiv_cli.verbs.statistics import Mean, are_measured
 
 
 def correlate(
@@ -175,27 +175,18 @@ def correlate_files(
                 )
         if output is not None:
             console.say(f"{output}: is not written: the vectors are there, and --mean alone is made of them")
-        return mean_of_measured(volumes, options.mean, options, options.derived, overwrite, console)
+        mean = Mean(options.mean, volumes, None, options.derived, overwrite)
+        return carried_out(mean, options, console)
     if output is None:
         raise UsageError("-o: is missing, the file or folder of the vectors; only the --mean of vectors needs none")
     if options.watch:
-        batch, worked = _as_they_come(volumes, output, options, overwrite, console)
-        return worked.ensure_whole(batch.summary(worked), batch.unit)
-    batch = Correlation(volumes, output, options, overwrite)
-    if options.dry_run:
-        return dry_run(batch, options, console)
-    worked = work_through(batch, options, console)
-    fields = batch.fields(worked)
-    if options.mean is not None and fields:
-        mean = Mean(options.mean, fields, batch.settings.resolved(), options.derived, overwrite)
-        # What another worker made of the same fields in the meantime is as good.
-        work_through(mean, BatchOptions(resume=True), console)
-    return worked.ensure_whole(batch.summary(worked), batch.unit)
+        return _as_they_come(volumes, output, options, overwrite, console)
+    return carried_out(Correlation(volumes, output, options, overwrite), options, console)
 
 
 def _as_they_come(
     folders: Sequence[Path], output: Path, options: CorrelateOptions, overwrite: bool, console: Console
-) -> tuple[Correlation, Worked[Outcome]]:
+) -> dict[str, Any]:
     """Correlate the volumes of folders that are still being filled, each pair when both are there.
 
     Raises
@@ -213,10 +204,10 @@ def _as_they_come(
         two_by_two = tuple((number, number + 1) for number in range(0, len(files), 2))
         return Correlation(files, output, options, overwrite, Pairs(two_by_two))
 
-    coming = watched(folders, "results", options, options.idle_s, console)
-    pairs = coming_pairs(coming, results_seen, options, console, left_out)
-    groups = ([path for pair in group for path in pair] for group in pairs)
+    come = watched(folders, "results", options, options.idle_s, console)
     with atomic.folder_of(output / folders[0].name):
+        pairs = coming_pairs(come, results_seen, options, console, left_out)
+        groups = ([path for pair in group for path in pair] for group in pairs)
         return work_as_they_come(of_pairs, groups, options, console, left_out)
 
 
@@ -336,10 +327,14 @@ class Correlation(PairBatch[Outcome, CorrelateOptions]):
         """Return what is told of the batch."""
         return summary_of(worked, len(self._pairs) if self._options.ensemble else worked.total())
 
-    def fields(self, worked: Worked[Outcome]) -> list[Path]:
-        """Return the files of the fields that are there."""
+    def end(self, worked: Worked[Outcome], console: Console) -> None:
+        """Write the mean of the fields that are there, where it is asked for."""
         failed = {failure.name for failure in worked.failures}
-        return [target.path for target, name in zip(self.targets, self.names, strict=True) if name not in failed]
+        fields = [target.path for target, name in zip(self.targets, self.names, strict=True) if name not in failed]
+        if self._options.mean is not None and fields:
+            mean = Mean(self._options.mean, fields, self.settings.resolved(), self._options.derived, self.overwrite)
+            # What another worker made of the same fields in the meantime is as good.
+            work_through(mean, BatchOptions(resume=True), console)
 
     @property
     def settings(self) -> Config:

@@ -16,12 +16,12 @@ import tempfile
 import threading
 import time
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterator, Mapping, Sequence
 from concurrent.futures import CancelledError
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 from uuid import uuid4
 
 import dask
@@ -30,12 +30,11 @@ from distributed import Client, Future, KilledWorker, LocalCluster, Worker, Work
 import lfpiv_cli
 from lfpiv_cli.console import Console, Frames
 from lfpiv_cli.errors import InputError, LfpivError, StoppedEarlyError, UsageError
+from lfpiv_cli.files.atomic import SECONDS_BETWEEN_LOOKS, Turn
 from lfpiv_cli.files.batch import Stamp
-from lfpiv_cli.files.inputs import reason
-from lfpiv_cli.files.shares import SECONDS_BETWEEN_LOOKS, Deadline, Runs
+from lfpiv_cli.files.inputs import Deadline, reason
 from lfpiv_cli.notice import Notice
 from lfpiv_cli.threads import told_threads, use_threads
-from lfpiv_cli.verbs.batches import Attempts, Batch, Made, Turn, attempt
 
 # Workers on this machine, as many as it has cores, or `local:4`.
 LOCAL = re.compile(r"local(?::(\d{1,4}))?", re.ASCII)
@@ -58,9 +57,26 @@ class Reply:
     seconds: float = 0.0
 
 
+class Outputs(Protocol):
+    """What a batch is to those who hand it out: it begins in each process, and makes one output at a time."""
+
+    label: str
+    unit: str
+
+    @property
+    def names(self) -> Sequence[str]:
+        """What each output is called."""
+
+    def begin(self, numbers: Sequence[int], console: Console) -> float:
+        """Prepare what the outputs of these numbers share."""
+
+    def attempt(self, number: int, before: Stamp, work: Frames) -> Any:
+        """Make an output, unless another worker does or did."""
+
+
 def made_by_workers(
-    batch: Batch[Made], before: Mapping[int, Stamp], address: str, deadline: Deadline, console: Console
-) -> Attempts[Made]:
+    address: str, batch: Outputs, before: Mapping[int, Stamp], deadline: Deadline, work: Frames
+) -> Generator[tuple[int, Any], None, None]:
     """Yield outputs with what became of each, as the workers tell it.
 
     An output at which several workers ended comes last, with the error that says so. Where there is no time for another
@@ -68,8 +84,8 @@ def made_by_workers(
 
     Parameters
     ----------
-    before : the numbers of the outputs, and what was in their places when the batch began
     address : of a scheduler, or `local`
+    before : the numbers of the outputs, and what was in their places when the batch began
 
     Raises
     ------
@@ -78,6 +94,7 @@ def made_by_workers(
     """
     if not before:
         return
+    console = work.console
     kept, local = _Kept(batch, list(before), told_threads() or 1), LOCAL.fullmatch(address)
     with ExitStack() as stack:
         try:
@@ -111,7 +128,7 @@ def made_by_workers(
 class _Kept(WorkerPlugin):
     """What a worker process keeps of a command: its batch, made when the first output is asked for."""
 
-    def __init__(self, batch: Batch[Any], numbers: Sequence[int], threads: int) -> None:
+    def __init__(self, batch: Outputs, numbers: Sequence[int], threads: int) -> None:
         """Take the batch of the command, which travels as its arguments, and all numbers that will be asked for."""
         self.name = f"lfpiv-{uuid4().hex}"
         self._arguments, self._numbers, self._threads = pickle.dumps(batch), numbers, threads
@@ -120,7 +137,7 @@ class _Kept(WorkerPlugin):
     def setup(self, worker: Worker) -> None:
         """Begin in a worker process."""
         self._alone = threading.Lock()
-        self._batch: Batch[Any] | None = None
+        self._batch: Outputs | None = None
 
     def make(self, number: int, before: Stamp) -> Reply:
         """Make an output as the command itself would, in its folder; one at a time in each process."""
@@ -139,11 +156,11 @@ class _Kept(WorkerPlugin):
                 # Paths mean what they mean to the command.
                 with contextlib.chdir(self._folder):
                     if self._batch is None:
-                        batch: Batch[Any] = pickle.loads(self._arguments)
+                        batch: Outputs = pickle.loads(self._arguments)
                         batch.begin(self._numbers, console)
                         self._batch = batch
                     work = Frames(console, 1, 1.0, self._batch.label, self._batch.unit)
-                    made = attempt(self._batch, number, before, work)
+                    made = self._batch.attempt(number, before, work)
             except LfpivError as error:
                 made = error
         return Reply(made, warned, time.monotonic() - begun)
@@ -173,6 +190,45 @@ def _own_cluster(workers: int) -> Iterator[str]:
         ) as cluster,
     ):
         yield cluster.scheduler_address
+
+
+class Runs:
+    """Frames that are left, for workers of which each goes on with the next frame after its last.
+
+    So what neighbouring frames have in common, a pair or the frames of a background, is mostly read by one worker.
+    """
+
+    def __init__(self, numbers: Sequence[int]) -> None:
+        """Take the numbers of the frames, in their order."""
+        self._numbers = list(numbers)
+        self._left = set(range(len(self._numbers)))
+        # The place in the order that each worker was given last.
+        self._last: dict[str, int] = {}
+
+    def __len__(self) -> int:
+        """Return how many frames are left."""
+        return len(self._left)
+
+    def next_for(self, worker: str) -> int:
+        """Return the next frame for a worker, of which there are some left."""
+        place = self._last.get(worker, -1) + 1
+        if worker not in self._last or place not in self._left:
+            # Where the longest run that is left begins, or its middle if somebody else comes to its begin.
+            runs: list[list[int]] = []
+            for left in sorted(self._left):
+                if runs and left == runs[-1][-1] + 1:
+                    runs[-1].append(left)
+                else:
+                    runs.append([left])
+            longest = max(runs, key=len)
+            place = longest[len(longest) // 2 if longest[0] - 1 in self._last.values() else 0]
+        self._last[worker] = place
+        self._left.remove(place)
+        return self._numbers[place]
+
+    def put_back(self, number: int) -> None:
+        """Take back a frame that a worker was given."""
+        self._left.add(self._numbers.index(number))
 
 
 class _Outputs:

@@ -19,7 +19,7 @@ import numpy as np
 
 from lfpiv_cli.console import CONSOLE, Console, Frames
 from lfpiv_cli.errors import InputError, UsageError
-from lfpiv_cli.files import atomic, export_vtk, pairing, shares
+from lfpiv_cli.files import atomic, export_vtk, pairing
 from lfpiv_cli.files import images as image_files
 from lfpiv_cli.files.batch import VTKHDF_SUFFIX, Frame, Target, frames_of, images_seen, output_paths, pending
 from lfpiv_cli.files.config import Config, carried_config
@@ -32,7 +32,7 @@ from lfpiv_cli.particles.neighbour_frames import STEPS as PREDICTED_STEPS
 from lfpiv_cli.tracks.candidates import Trajectories
 from lfpiv_cli.verbs import frames as of_frames
 from lfpiv_cli.verbs import particles
-from lfpiv_cli.verbs.batches import ALL, Batch, BatchOptions, Failure, WorkOptions, dry_run, work_through
+from lfpiv_cli.verbs.batches import ALL, Batch, BatchOptions, Failure, WorkOptions, carried_out, work_through
 from lfpiv_cli.verbs.checks import few_notices
 from lfpiv_cli.verbs.following import SHORTEST, BothWays, Forwards, Recorded, ensure_sequence
 from lfpiv_cli.verbs.frames import ImageOptions
@@ -125,7 +125,7 @@ class Way(Batch[None]):
             none = {name: np.zeros(shape) for name, shape in shapes.items()}
             return Points(np.zeros((0, 3)), none, self.reference, {}, {})
         if not path.exists():
-            with shares.awaited(path):  # another worker makes it now
+            with atomic.awaited(path):  # another worker makes it now
                 pass
         return read_points(path, PARTICLES_FORMAT)
 
@@ -174,8 +174,15 @@ def follow_particles(
     ways = _ways(output, frames, settings, tracking, (weights, images), options, overwrite)
     last, there, results = ways[-1], ways[-1].order, [output / TRACKS, output / PLAYBACK]
     last.left_out, last.beside = left_out, [*results, *(path for way in ways[:-1] for path in way.outputs)]
+    chosen = BatchOptions(
+        resume=options.resume,
+        keep_going=options.keep_going,
+        dry_run=options.dry_run,
+        time_limit_s=options.time_limit_s,
+        begun_s=options.begun_s,
+    )
     if options.dry_run:
-        return dry_run(last, options, console)
+        return carried_out(last, replace(chosen, failures=options.failures), console)
     for path in results:
         atomic.ensure_writable(path, replacing, last.inputs)
     if last is not ways[0]:
@@ -184,10 +191,6 @@ def follow_particles(
         last.ensure_residuals([there[k] for k in there_again])
     sequence, said = _recorded(
         prepared.searchable(weights, settings), settings, tracking, frames, ways[0], options, console
-    )
-
-    chosen = BatchOptions(
-        resume=options.resume, keep_going=options.keep_going, time_limit_s=options.time_limit_s, begun_s=options.begun_s
     )
     forwards = Forwards(sequence, ways[0].read)
     found: Trajectories | None = None

@@ -14,9 +14,19 @@ from typing import Any, Generic, TypeVar
 
 from lfpiv_cli.console import Console, Frames
 from lfpiv_cli.errors import InputError, UsageError
+from lfpiv_cli.files import atomic, vtkhdf
 from lfpiv_cli.files import images as image_files
-from lfpiv_cli.files import listing, shares, vtkhdf
-from lfpiv_cli.files.batch import Stamp, State, Target, pending, results_seen, stamp_of, state_or_none
+from lfpiv_cli.files.batch import (
+    Stamp,
+    State,
+    Target,
+    as_they_come,
+    files_in,
+    pending,
+    results_seen,
+    stamp_of,
+    state_or_none,
+)
 from lfpiv_cli.files.pairing import Pairs, Seen, contradiction, in_order, pair_frames, pairs_listed
 from lfpiv_cli.files.provenance import Gone, carried_record, sha256, without_warnings
 from lfpiv_cli.names import InputKind, Pairing
@@ -139,7 +149,6 @@ def doubts(frames: Sequence[Seen]) -> list[Notice]:
 # Batches of folders that are still being filled: what is complete is worked through, then what has come since.
 
 
-OfBatch = TypeVar("OfBatch", bound=Batch)
 Item = TypeVar("Item")
 # So many that have come without a single pair among them are told.
 MOST_ALONE = 4
@@ -185,9 +194,9 @@ def watched(
         def listed() -> list[Path]:
             if not deadline.leaves_time():
                 raise deadline.error(count, count, "frame")
-            return [path for folder in folders for path in listing.files_in(folder, kind)]
+            return [path for folder in folders for path in files_in(folder, kind)]
 
-        for group in listing.as_they_come(listed, read, idle_s, passed_over):
+        for group in as_they_come(listed, read, idle_s, passed_over):
             count += len(group)
             yield group
         if count == 0:
@@ -197,13 +206,13 @@ def watched(
 
 
 def work_as_they_come(
-    make: Callable[[Sequence[Path]], OfBatch],
+    make: Callable[[Sequence[Path]], Batch[Any]],
     groups: Iterable[Sequence[Path]],
     options: BatchOptions,
     console: Console,
     left_out: Sequence[Failure] = (),
-) -> tuple[OfBatch, Worked]:
-    """Work through a batch for each group of files; return the last one, and what became of all.
+) -> dict[str, Any]:
+    """Work through a batch for each group of files; return what the last one reports of all.
 
     Parameters
     ----------
@@ -211,12 +220,12 @@ def work_as_they_come(
 
     Raises
     ------
-    LfpivError : as `work_through`
+    LfpivError : as `carried_out`
     InputError : there was no group
     """
     alone = replace(options, failures=None)
     together: Worked = Worked()
-    batch: OfBatch | None = None
+    batch: Batch[Any] | None = None
     for group in groups:
         try:
             batch = make(group)
@@ -230,11 +239,11 @@ def work_as_they_come(
     if batch is None:
         raise InputError(f"{together.failures[0].name}: {together.failures[0].error}")
     together.list_failures(options.failures)
-    return batch, together
+    return together.ensure_whole(batch.summary(together), batch.unit)
 
 
 def coming_pairs(
-    coming: Iterable[Sequence[Item]],
+    groups: Iterable[Sequence[Item]],
     seen_of: Callable[[Sequence[Item]], Sequence[Seen]],
     options: PairOptions,
     console: Console,
@@ -250,7 +259,7 @@ def coming_pairs(
     items: list[Item] = []
     made: set[tuple[int, int]] = set()
     reported: set[Notice] = set()
-    for more in coming:
+    for more in groups:
         items += more
         seen = seen_of(items)
         if len(items) < 2:
@@ -326,7 +335,7 @@ class PairByPair(Batch[Made]):
             target = self._found.targets[k]
             stamp = stamp_of(target.path)
             if stamp is None or self._whole.get(k) != stamp:
-                with shares.awaited(target.path):
+                with atomic.awaited(target.path):
                     if state_or_none(target) is not State.COMPLETE:
                         self._found.make(k, work)
                 self._whole[k] = stamp_of(target.path)

@@ -171,12 +171,10 @@ def reconstruct_files(
         options.ensure_one_by_one()
         groups = watched(images, "images", options, options.idle_s, console)
         with atomic.folder_of(output / weights.name):
-            batch, worked = work_as_they_come(
+            return work_as_they_come(
                 lambda group: Reconstruction(weights, group, output, options, overwrite), groups, options, console
             )
-    else:
-        return carried_out(Reconstruction(weights, images, output, options, overwrite), options, console)
-    return worked.ensure_whole(batch.summary(worked), batch.unit)
+    return carried_out(Reconstruction(weights, images, output, options, overwrite), options, console)
 
 
 @dataclass(frozen=True, eq=False)

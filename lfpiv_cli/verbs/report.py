@@ -19,10 +19,10 @@ from lfpiv_cli.console import CONSOLE, Console, readable
 from lfpiv_cli.errors import ConfigError, InputError, UsageError
 from lfpiv_cli.files import pages, particle_file
 from lfpiv_cli.files.atomic import ensure_writable
+from lfpiv_cli.files.batch import natural
 from lfpiv_cli.files.calibration_file import open_calibration
 from lfpiv_cli.files.config import carried_config
 from lfpiv_cli.files.images import count_pages
-from lfpiv_cli.files.listing import natural
 from lfpiv_cli.files.pages import Page, Picture, Section, Table, write_pages, write_picture
 from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, Points
 from lfpiv_cli.files.provenance import sha256

@@ -30,7 +30,7 @@ from lfpiv_cli.files.pairing import Pairs
 from lfpiv_cli.files.provenance import Gone, carried_record, sha256, without_warnings
 from lfpiv_cli.names import FlowMethod
 from lfpiv_cli.verbs import build_weights, calibrate, correlate, run_choice, run_steps
-from lfpiv_cli.verbs.batches import ALL, MB, Expected, dry_run, estimate
+from lfpiv_cli.verbs.batches import ALL, MB, Expected, carried_out, estimate
 from lfpiv_cli.verbs.follow import follow_particles
 from lfpiv_cli.verbs.following import SHORTEST, ensure_sequence
 from lfpiv_cli.verbs.pairs import found_pairs
@@ -110,17 +110,17 @@ def planned(chain: Chain) -> dict[str, Any]:
     for method in methods:
         if options.follow:
             # The frames of a sequence depend on the whole config.
-            whole = replace(chain.following(dry_run=True), resume=to_come is None)
+            whole = replace(chain.following(), resume=to_come is None)
             reported[method] = follow_particles(weights, options.images, output, whole, **chain.common)
             continue
         found = chain.reconstruction(method, weights, to_come)
         in_time = method == "particles" and not chain.pairs.separate
         if options.keep == "all" or in_time:
-            reported[method] = dry_run(found, chain.batch_options(shared=False), console)
+            reported[method] = carried_out(found, chain.batch_options(shared=False), console)
         if not in_time:
             size = correlate.field_bytes(settings, settings.grid()) if method == "volumes" else None
             batch = chain.in_pairs(method, found, size)
-            reported[run_steps.RESULTS[method]] = dry_run(batch, chain.batch_options(shared=True), console)
+            reported[run_steps.RESULTS[method]] = carried_out(batch, chain.batch_options(shared=True), console)
     return counts | {"method": " and ".join(methods)} | _together(reported)
 
 

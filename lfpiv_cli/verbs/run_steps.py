@@ -17,11 +17,12 @@ from typing import Any
 from lfpiv_cli.console import Console
 from lfpiv_cli.errors import InputError, LfpivError, OutputExistsError, PartialError, StoppedEarlyError
 from lfpiv_cli.files import atomic
+from lfpiv_cli.files.atomic import awaited
 from lfpiv_cli.files.batch import VTKHDF_SUFFIX, Frame, Stamp, Target, stamp_of
 from lfpiv_cli.files.config import Config
+from lfpiv_cli.files.inputs import Deadline
 from lfpiv_cli.files.pairing import Pairs
 from lfpiv_cli.files.provenance import Gone, carried_record, same_result, sha256
-from lfpiv_cli.files.shares import Deadline, awaited
 from lfpiv_cli.names import FlowMethod, Kept, RunMethod
 from lfpiv_cli.verbs import correlate as correlating
 from lfpiv_cli.verbs import track as tracking
@@ -256,7 +257,7 @@ class Chain:
         """The options of every batch."""
         given = self.options
         limit = {"time_limit_s": given.time_limit_s, "begun_s": given.begun_s}
-        return {"resume": True, "keep_going": given.keep_going} | limit
+        return {"resume": True, "keep_going": given.keep_going, "dry_run": given.dry_run} | limit
 
     @property
     def photographs(self) -> CalibrateOptions:
@@ -388,10 +389,10 @@ class Chain:
         lost = {failure.name for failure in self.failures}
         return {number: vectors[number] for number in numbers if paths[number].stem not in lost}
 
-    def following(self, dry_run: bool = False) -> FollowOptions:
+    def following(self) -> FollowOptions:
         """Return the options of a sequence that is followed."""
         given = self.options
-        return FollowOptions(**self._of_images, dt_s=given.dt_s, dry_run=dry_run, **self._resuming)
+        return FollowOptions(**self._of_images, dt_s=given.dt_s, **self._resuming)
 
     def batch_options(self, shared: bool) -> BatchOptions:
         """Return the options of a batch, `shared` where it is one of all pairs."""

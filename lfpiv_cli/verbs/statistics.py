@@ -11,13 +11,13 @@ import numpy as np
 
 from lfpiv_cli.console import CONSOLE, Console, Frames
 from lfpiv_cli.errors import InputError, UsageError
-from lfpiv_cli.files import atomic, config, hdf5, inputs, listing, vtkhdf
-from lfpiv_cli.files.batch import Target, is_kept
+from lfpiv_cli.files import atomic, config, hdf5, inputs, vtkhdf
+from lfpiv_cli.files.batch import Target, is_kept, natural
 from lfpiv_cli.files.particle_file import TRACKS_FORMAT, TRAJECTORIES_FORMAT, open_tracks
 from lfpiv_cli.files.provenance import OF_COORDINATES, ensure_agreement, record, with_warnings
 from lfpiv_cli.flow.combining import Paths, vectors_from_paths
 from lfpiv_cli.flow.field import REJECTED, VectorField, derived_fields
-from lfpiv_cli.verbs.batches import Batch, BatchOptions, work_through
+from lfpiv_cli.verbs.batches import Batch, Worked
 from lfpiv_cli.verbs.checks import quality_of
 from lfpiv_cli.verbs.fields import arrays_of, samples_of_tracks
 from lfpiv_cli.verbs.moments import notices_of, of_fields, of_tracks, parse_profile
@@ -35,9 +35,12 @@ class Mean(Batch[None]):
     label, unit = "mean", "file"
 
     def __init__(
-        self, path: Path, fields: Sequence[Path], resolved: Mapping[str, Any], derived: bool, overwrite: bool
+        self, path: Path, fields: Sequence[Path], resolved: Mapping[str, Any] | None, derived: bool, overwrite: bool
     ) -> None:
-        """Take where it goes, the files of vectors, and their settings."""
+        """Take where it goes, the files of vectors, and their settings; without these, they are asked to be alike."""
+        if resolved is None:
+            fields, records = _alike(fields, in_bins=False)
+            resolved = records[0].get("config") or {}
         self.inputs, self._resolved, self._derived, self.overwrite = fields, resolved, derived, overwrite
         self.targets = [Target(path, self._record)]
 
@@ -53,6 +56,12 @@ class Mean(Batch[None]):
         extra = arrays_of(derived_fields(found.mean)) if self._derived else {}
         mean = replace(found.mean, provenance=dict(target.record))
         Vectors(mean, found.arrays() | extra, found.tables(), found.attributes()).write(target.path, overwrite=True)
+
+    def summary(self, worked: Worked[None]) -> dict[str, Any]:
+        """Return what is told of it."""
+        found = vtkhdf.open_vectors(self.targets[0].path)
+        reported = {"files": len(self.inputs), "skipped": worked.skipped, "vectors": found.flag.size}
+        return reported | {"rejected": int(np.count_nonzero(found.flag >= REJECTED))} | quality_of(found).summary()
 
     def _record(self) -> dict[str, Any]:
         return record("correlate mean", self._resolved, _named(self.inputs))
@@ -84,7 +93,7 @@ def _alike(files: Sequence[Path], in_bins: bool) -> tuple[list[Path], list[dict[
     ------
     InputError : they were not made alike, or are no vectors and no tracks
     """
-    formats = {path: hdf5.format_of(path) for path in sorted(files, key=lambda path: listing.natural(str(path)))}
+    formats = {path: hdf5.format_of(path) for path in sorted(files, key=lambda path: natural(str(path)))}
     for path, name in formats.items():
         if name not in MEASURED:
             raise InputError(f"{path}: holds {name}, expected vectors or tracks")
@@ -104,23 +113,6 @@ def _alike(files: Sequence[Path], in_bins: bool) -> tuple[list[Path], list[dict[
     records = [header.provenance for header in headers]
     ensure_agreement(records, [str(path) for path in kept], OF_COORDINATES)
     return kept, records
-
-
-def mean_of_measured(
-    files: Sequence[Path], mean: Path, options: BatchOptions, derived: bool, overwrite: bool, console: Console
-) -> dict[str, Any]:
-    """Write the mean of vectors and tracks that are there; return what is told of it.
-
-    Raises
-    ------
-    InputError : they were not made alike
-    """
-    files, records = _alike(files, in_bins=False)
-    batch = Mean(mean, files, records[0].get("config") or {}, derived, overwrite)
-    worked = work_through(batch, options, console)
-    found = vtkhdf.open_vectors(mean)
-    reported = {"files": len(files), "skipped": worked.skipped, "vectors": found.flag.size}
-    return reported | {"rejected": int(np.count_nonzero(found.flag >= REJECTED))} | quality_of(found).summary()
 
 
 def _fields_in(path: Path) -> Iterator[VectorField]:
