@@ -26,7 +26,7 @@ from lfpiv_cli.optics.shapes import HeightMap, ScenePose
 from lfpiv_cli.optics.surfaces import Cylinder, Plane, Sphere, TiltedPlane
 from lfpiv_cli.optics.tracing import ObjectSpace
 from lfpiv_cli.verbs import validate, validate_board
-from lfpiv_cli.verbs.build_weights import plan_of, ray_source, weights_of
+from lfpiv_cli.verbs.build_weights import plan_of, weights_of
 from lfpiv_cli.verbs.particles import searchable
 from lfpiv_cli.verbs.planning import bench_of
 from lfpiv_cli.weights.build import factorise, scene_distortion
@@ -160,7 +160,7 @@ def test_heights_that_are_none_or_given_twice_are_named(tmp_path: Path, configur
 
 def test_without_a_scene_layers_are_plane_and_weights_are_made_through_one(configured: Callable[[str], Config]) -> None:
     assert configured(RIG).object_space() == ObjectSpace(WATER, None, "paraxial")
-    assert isinstance(ray_source(configured(RIG + TUBE), None), CurvedSpace)
+    assert isinstance(configured(RIG + TUBE).ray_source(None), CurvedSpace)
     kinds = [get_args(section.model_fields["kind"].annotation)[0] for section in get_args(get_args(FaceSection)[0])]
     assert kinds == list(get_args(SurfaceKind))
     assert configured(RIG + TUBE + "pipe: {radius_mm: 5.0, centre_mm: [3, 0, 0]}").pipe is not None

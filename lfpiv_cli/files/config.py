@@ -33,6 +33,7 @@ from lfpiv_cli.optics.tracing import ObjectSpace
 from lfpiv_cli.reconstruction.registry import SOLVERS
 from lfpiv_cli.reconstruction.solvers import SolverSettings, Stopping
 from lfpiv_cli.synthetic.flows import Flow
+from lfpiv_cli.weights.scene import Source
 
 # Of the paper's final window along the axis with the smallest voxels; the coarse one is twice as large: a displacement
 # of a quarter of its side does not leave it.
@@ -183,6 +184,22 @@ class Config:
         if scene is not None and self.weights.method != "dlfc":
             return scene
         return self.plane_space("tracing rays", mid_plane_z_mm)
+
+    def ray_source(self, found: Calibration | None) -> Source:
+        """Return how rays are found: traced through the configured object space, or as a calibration fitted them.
+
+        Raises
+        ------
+        ConfigError : fitted rays are asked for and there are none
+        """
+        if self.weights.method != "dlfc":
+            return self.object_space(found.mid_plane_z_mm if found else None)
+        if found is None or found.ray_fit is None:
+            raise ConfigError(
+                "weights.method: dlfc needs a --calibration from boards at several depths: calibrate-snapshot with "
+                "--board and --depth-mm, repeated in pairs"
+            )
+        return found.ray_fit.rays
 
     def scene_space(self) -> CurvedSpace | None:
         """Return the faces of `scene`, None where there is none."""

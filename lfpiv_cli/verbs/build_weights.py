@@ -123,18 +123,29 @@ def plan_of(settings: Config, found: Calibration | None) -> Plan:
                 "channel: they say where the mid plane lies"
             )
         reference = Reference(reference.name, found.mid_plane_z_mm)
-    source, grid, sheet = ray_source(settings, found), settings.grid(reference), settings.camera_model()
-    beyond = _reach_notices(settings, found, grid)
     notices = weights_cost.check_rig(settings, found)
+    source, grid, sheet = settings.ray_source(found), settings.grid(reference), settings.camera_model()
     camera, padding = found.camera(sheet) if found else sheet, settings.reconstruction.padding_voxel
+    # What may lie out of view without a word, and what the sensor sees of the voxels' light within it.
+    x, y, z = (-math.ceil(RIM_SHARE * n) if n > 2 else 0 for n in grid.shape_xyz)
+    smallest, largest = seen_share(camera, source, grid.padded((x, y, z)))
+    if largest < LEAST_SEEN:
+        bounds = [grid.bounds_mm(axis) for axis in range(3)]
+        spans = ", ".join(
+            f"{axis} {written(low, 4)} to {written(high, 4)}" for axis, (low, high) in zip("xyz", bounds, strict=True)
+        )
+        raise ConfigError(f"volume: none of it ({spans} mm) lies in the camera's view")
     if not padding and isinstance(source, CurvedSpace):
         padding = curved_padding(camera, source, grid)
     padding = padding or default_padding(camera, settings.media_model(), grid)
     weights_cost.check_rays(settings, source, grid.padded(padding))
+    beyond = _reach_notices(settings, found, grid)
     notices += weights_cost.ray_notices(settings, found, camera, source, grid)
-    # What may lie out of view without a word.
-    x, y, z = (-math.ceil(RIM_SHARE * n) if n > 2 else 0 for n in grid.shape_xyz)
-    notices += _view_notices(*seen_share(camera, source, grid.padded((x, y, z))), grid)
+    if smallest < LEAST_SEEN:
+        text = "a part of it lies outside the camera's view, where nothing will be found"
+        remedy = "a smaller volume, or another centre_mm"
+        expected = f"at least {LEAST_SEEN:g} of each voxel's light on the sensor"
+        notices.append(Notice("volume-out-of-view", "volume", text, remedy, float(smallest), expected))
     return Plan(settings, found, camera, reference, grid, padding, source, notices + beyond)
 
 
@@ -203,23 +214,6 @@ def misfit_notices(content: WeightsFile) -> list[Notice]:
     return [Notice("weights-inexact", "volume", text, remedy, largest, f"at most {LARGEST_MISFIT_L1:g}")]
 
 
-def ray_source(settings: Config, found: Calibration | None) -> Source:
-    """Return how rays are found: traced through the configured object space, or as a calibration fitted them.
-
-    Raises
-    ------
-    ConfigError : fitted rays are asked for and there are none
-    """
-    if settings.weights.method != "dlfc":
-        return settings.object_space(found.mid_plane_z_mm if found else None)
-    if found is None or found.ray_fit is None:
-        raise ConfigError(
-            "weights.method: dlfc needs a --calibration from boards at several depths: calibrate-snapshot with --board "
-            "and --depth-mm, repeated in pairs"
-        )
-    return found.ray_fit.rays
-
-
 def _reach_notices(settings: Config, found: Calibration | None, grid: Grid) -> list[Notice]:
     """Return where a volume reaches far beyond the boards that its rays were fitted to."""
     if settings.weights.method != "dlfc" or found is None or found.ray_fit is None:
@@ -241,27 +235,6 @@ def _reach_notices(settings: Config, found: Calibration | None, grid: Grid) -> l
                 Notice("beyond-boards", "volume", text, remedy, float(beyond), f"at most {written(most)} mm")
             )
     return notices
-
-
-def _view_notices(smallest: float, largest: float, grid: Grid) -> list[Notice]:
-    """Return whether the sensor sees a volume only in part, by the shares of its voxels' light that it sees.
-
-    Raises
-    ------
-    ConfigError : the sensor sees none of it
-    """
-    if largest < LEAST_SEEN:
-        bounds = [grid.bounds_mm(axis) for axis in range(3)]
-        spans = ", ".join(
-            f"{axis} {written(low, 4)} to {written(high, 4)}" for axis, (low, high) in zip("xyz", bounds, strict=True)
-        )
-        raise ConfigError(f"volume: none of it ({spans} mm) lies in the camera's view")
-    if smallest >= LEAST_SEEN:
-        return []
-    text = "a part of it lies outside the camera's view, where nothing will be found"
-    remedy = "a smaller volume, or another centre_mm"
-    expected = f"at least {LEAST_SEEN:g} of each voxel's light on the sensor"
-    return [Notice("volume-out-of-view", "volume", text, remedy, float(smallest), expected)]
 
 
 @dataclass(frozen=True, kw_only=True)

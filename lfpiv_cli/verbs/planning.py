@@ -27,7 +27,6 @@ from lfpiv_cli.optics.media import Media
 from lfpiv_cli.synthetic.flows import MM_PER_M
 from lfpiv_cli.validation import planning
 from lfpiv_cli.validation.planning import Miniature, Tracer
-from lfpiv_cli.verbs.build_weights import ray_source
 from lfpiv_cli.verbs.checks import Line, Verdict
 from lfpiv_cli.verbs.particles import light_of
 from lfpiv_cli.verbs.simulate import readout_of
@@ -308,7 +307,7 @@ def diffraction_line(bench: Bench) -> Line:
 def _source(bench: Bench) -> Source:
     """Return how rays are found; a channel's mid plane that is not known is where the camera is focused."""
     if bench.settings.weights.method == "dlfc":
-        return ray_source(bench.settings, bench.found)
+        return bench.settings.ray_source(bench.found)
     return bench.settings.plane_space("planning", bench.mid_plane_z_mm)
 
 
