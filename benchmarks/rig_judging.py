@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from benchmarks.rig_drawing import DT_S, DrawnRig
 from lfpiv_cli.files.calibration_file import open_calibration
 from lfpiv_cli.files.config import Config
-from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, TRACKS_FORMAT, read_points
-from lfpiv_cli.files.particles import read_particles
+from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, TRACKS_FORMAT, read_particles, read_points
 from lfpiv_cli.files.vtkhdf import open_vectors
 from lfpiv_cli.flow.field import REJECTED
 from lfpiv_cli.grid import Grid

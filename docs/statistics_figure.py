@@ -11,7 +11,7 @@ from lfpiv_cli.files.config import load_rig
 from lfpiv_cli.files.particle_file import Points, symmetric
 from lfpiv_cli.flow.statistics import PAIRS
 from lfpiv_cli.grid import FOCAL_POINT
-from lfpiv_cli.pictures.statistics import profile_figure
+from lfpiv_cli.pictures.points import profile_figure
 from lfpiv_cli.synthetic.flows import random_modes
 from lfpiv_cli.verbs.moments import of_tracks
 

@@ -15,7 +15,7 @@ from lfpiv_cli.cli.main import cli
 from lfpiv_cli.errors import ConfigError, InputError, LimitMissedError, UsageError
 from lfpiv_cli.files.config import load_rig
 from lfpiv_cli.files.images import write_tiff
-from lfpiv_cli.files.particles import read_particles
+from lfpiv_cli.files.particle_file import read_particles
 from lfpiv_cli.files.vtkhdf import open_vectors, open_volume
 from lfpiv_cli.files.weights_file import open_weights
 from tests.commands import CONFIG, SAMPLE, run, told

@@ -11,12 +11,13 @@ from scipy.io import loadmat, netcdf_file
 
 from lfpiv_cli.errors import InputError, OutputError, UsageError
 from lfpiv_cli.files import export_formats as formats
-from lfpiv_cli.files.export_formats import FORMATS, Content, columns_of, read_content
+from lfpiv_cli.files.export_formats import Content, columns_of, read_content
 from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, TRACKS_FORMAT, TRAJECTORIES_FORMAT, Points, write_points
 from lfpiv_cli.files.vtkhdf import write_vectors, write_volume
 from lfpiv_cli.flow.field import VectorField
 from lfpiv_cli.grid import Grid, Reference
 from lfpiv_cli.names import ExportFormat
+from lfpiv_cli.verbs.export import FORMATS
 from tests.commands import run
 from tests.read_back import same
 from tests.vector_fields import points_of

@@ -18,8 +18,9 @@ import pytest
 
 from lfpiv_cli.cli.main import COMMANDS
 from lfpiv_cli.cli.options import FILE
-from lfpiv_cli.files.export_formats import FORMATS, read_content
+from lfpiv_cli.files.export_formats import read_content
 from lfpiv_cli.names import ExportFormat, names_in
+from lfpiv_cli.verbs.export import FORMATS
 from tests.commands import ROOT
 from tests.hostile_files import ended, make_no_file
 from tests.read_back import READERS, by_hdf5

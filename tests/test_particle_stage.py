@@ -14,8 +14,14 @@ from lfpiv_cli.errors import InputError, OutputExistsError, PartialError, UsageE
 from lfpiv_cli.files import particle_file, vtkhdf
 from lfpiv_cli.files.config import carried_config, load_rig
 from lfpiv_cli.files.images import read_image
-from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, TRACKS_FORMAT, TRAJECTORIES_FORMAT, Points, read_points
-from lfpiv_cli.files.particles import read_particles
+from lfpiv_cli.files.particle_file import (
+    PARTICLES_FORMAT,
+    TRACKS_FORMAT,
+    TRAJECTORIES_FORMAT,
+    Points,
+    read_particles,
+    read_points,
+)
 from lfpiv_cli.files.vtkhdf import open_vectors
 from lfpiv_cli.grid import Reference
 from lfpiv_cli.validation.volume import particle_figures

@@ -18,7 +18,7 @@ from lfpiv_cli.pictures import points as of_points
 from lfpiv_cli.pictures import style
 from lfpiv_cli.pictures import vectors as of_volume
 from lfpiv_cli.pictures import vectors as pictures
-from lfpiv_cli.pictures.statistics import convergence_figure
+from lfpiv_cli.pictures.points import convergence_figure
 from lfpiv_cli.pictures.style import COLOURS, MARKERS, SETTINGS, SLABS, percentiles_by_depth, scale_of, symmetric_limit
 from lfpiv_cli.verbs.plot import figures_of
 from tests.commands import CONFIG

@@ -14,8 +14,7 @@ from lfpiv_cli.errors import ConfigError, InputError
 from lfpiv_cli.files.calibration_file import open_calibration, write_calibration
 from lfpiv_cli.files.config import load_rig
 from lfpiv_cli.files.hdf5 import open_h5, read_provenance
-from lfpiv_cli.files.particle_file import open_particles
-from lfpiv_cli.files.particles import read_particles
+from lfpiv_cli.files.particle_file import open_particles, read_particles
 from lfpiv_cli.files.vtkhdf import open_vectors
 from lfpiv_cli.files.weights_file import open_weights
 from lfpiv_cli.flow.field import MASKED

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from lfpiv_cli.errors import InputError
-from lfpiv_cli.files.particles import read_particles
+from lfpiv_cli.files.particle_file import read_particles
 from lfpiv_cli.files.vtkhdf import write_vectors
 from lfpiv_cli.grid import FOCAL_POINT
 from tests.commands import CONFIG, SAMPLE

@@ -8,9 +8,8 @@ from scipy.interpolate import BSpline
 
 from lfpiv_cli.arrays import Floats, Integers
 from lfpiv_cli.fields import stencils
-from lfpiv_cli.fields.evidence import first_expectation, most_probable
 from lfpiv_cli.fields.fit import FEW_SAMPLES, Field, fit_field
-from lfpiv_cli.fields.spline_field import SplineField, lattice_for
+from lfpiv_cli.fields.spline_field import SplineField, first_expectation, lattice_for, most_probable
 from lfpiv_cli.fields.stencils import DIVERGENCE, SECOND, SECOND_IN_DEPTH, SMOOTHNESS, Expectation, Lattice, bound
 from lfpiv_cli.fields.structure import Samples, belonging, with_places, without_itself
 

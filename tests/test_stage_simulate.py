@@ -11,7 +11,7 @@ import pytest
 from lfpiv_cli.errors import ConfigError, InputError
 from lfpiv_cli.files.config import load_rig
 from lfpiv_cli.files.images import read_image
-from lfpiv_cli.files.particles import Particles, read_particles, write_particles
+from lfpiv_cli.files.particle_file import Particles, read_particles, write_particles
 from tests.commands import CONFIG, run, sample_rig
 
 

@@ -12,7 +12,7 @@ import yaml
 from lfpiv_cli.console import Console
 from lfpiv_cli.errors import ConfigError, LimitMissedError, OutputExistsError, UsageError
 from lfpiv_cli.files.config import load_rig
-from lfpiv_cli.files.particles import Particles, write_particles
+from lfpiv_cli.files.particle_file import Particles, write_particles
 from lfpiv_cli.files.vtkhdf import write_vectors
 from lfpiv_cli.grid import Grid, Reference
 from lfpiv_cli.synthetic.flows import shear

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from lfpiv_cli.errors import ConfigError, InputError, LimitMissedError
-from lfpiv_cli.files.particles import Particles, write_particles
+from lfpiv_cli.files.particle_file import Particles, write_particles
 from lfpiv_cli.files.vtkhdf import write_volume
 from lfpiv_cli.grid import Grid, Reference
 from lfpiv_cli.optics.camera import Lattice

@@ -22,7 +22,7 @@ from lfpiv_cli.files.batch import Frame, images_seen
 from lfpiv_cli.files.config import load_rig
 from lfpiv_cli.files.vtkhdf import write_vectors
 from lfpiv_cli.verbs import particles
-from lfpiv_cli.verbs import watch as watching
+from lfpiv_cli.verbs import run as watching
 from lfpiv_cli.verbs.batches import Failure
 from lfpiv_cli.verbs.checks import Line, Part
 from lfpiv_cli.verbs.contents import Contents, Fields

@@ -22,9 +22,17 @@ import numpy as np
 
 from lfpiv_cli.arrays import Floats
 from lfpiv_cli.fields import stencils
-from lfpiv_cli.fields.evidence import Box, first_expectation, most_probable
 from lfpiv_cli.fields.fit import Field
-from lfpiv_cli.fields.spline_field import LAST_CHANGE, POINTS_AT_ONCE, ROUNDS, SplineField, gradient_covariance_at
+from lfpiv_cli.fields.spline_field import (
+    LAST_CHANGE,
+    POINTS_AT_ONCE,
+    ROUNDS,
+    Box,
+    SplineField,
+    first_expectation,
+    gradient_covariance_at,
+    most_probable,
+)
 from lfpiv_cli.fields.structure import Samples, belonging, error_covariance, inverse_covariances, squares
 from lfpiv_cli.robust import MAD_TO_SIGMA
 

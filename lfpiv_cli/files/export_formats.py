@@ -1,9 +1,9 @@
-"""Results in the formats of other programs: their content in one form, what each format takes, how it is written."""
+"""Results in the formats of other programs: their content in one form, and how each format is written."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
@@ -12,15 +12,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lfpiv_cli.errors import InputError, OutputError, UsageError
-from lfpiv_cli.files import export_vtk as vtk
+from lfpiv_cli.errors import InputError, OutputError
 from lfpiv_cli.files import particle_file, vtkhdf
 from lfpiv_cli.files.hdf5 import format_of, open_h5
 from lfpiv_cli.files.particle_file import POSITION, TRAJECTORIES_FORMAT, Points
 from lfpiv_cli.files.vtkhdf import VECTORS_FORMAT, VOLUME_FORMAT, Volume
 from lfpiv_cli.flow.field import REJECTED, VectorField
 from lfpiv_cli.grid import Grid
-from lfpiv_cli.names import ExportFormat
 
 # What each format holds, as a person says it.
 KINDS = {
@@ -382,55 +380,3 @@ def write_tecplot(path: Path, content: Content) -> None:
 def _rows(columns: dict[str, NDArray[np.generic]]) -> Iterator[tuple[str, ...]]:
     """Yield the rows of columns as text."""
     return zip(*(map(repr, column.tolist()) for column in columns.values()), strict=True)
-
-
-@dataclass(frozen=True)
-class Format:
-    """A format: what follows the stem of its files, and what it takes.
-
-    Attributes
-    ----------
-    ending : of the file's name
-    takes : names of our formats
-    several : of these, those of which several times go into one file
-    write : writes one file; None where `verbs.export` says how, as times or records come into it
-    """
-
-    ending: str
-    takes: tuple[str, ...]
-    several: tuple[str, ...] = ()
-    write: Callable[[Path, Content], None] | None = None
-
-
-# A volume has millions of voxels: as rows of text it serves nobody.
-FORMATS: dict[ExportFormat, Format] = {
-    "netcdf": Format(".nc", ON_GRIDS + OF_POINTS, several=(VECTORS_FORMAT,)),
-    "tecplot": Format(".dat", ON_GRIDS + OF_POINTS, write=write_tecplot),
-    "csv": Format(".csv", (VECTORS_FORMAT, *OF_POINTS), write=write_csv),
-    "mat": Format(".mat", ON_GRIDS + OF_POINTS, write=write_mat),
-    "vti": Format(".vti", ON_GRIDS, write=vtk.write_vti),
-    "vtp": Format(".vtp", OF_POINTS, write=vtk.write_vtp),
-    "vtkhdf-series": Format("_series.vtkhdf", (*ON_GRIDS, TRAJECTORIES_FORMAT), several=ON_GRIDS),
-}
-
-
-def ensure_fits(path: Path, format_name: str, to: ExportFormat, count: int) -> None:
-    """Refuse what a format does not take, with the formats that do.
-
-    Parameters
-    ----------
-    path, format_name : of the first file and of what it holds
-    count : how many files there are
-
-    Raises
-    ------
-    InputError : the format takes no such file
-    UsageError : it takes one at a time
-    """
-    kind, fitting = KINDS[format_name], [name for name, each in FORMATS.items() if format_name in each.takes]
-    if to not in fitting:
-        raise InputError(f"{path}: holds {kind}, which {to} does not take; {', '.join(fitting)} do")
-    if count > 1 and format_name not in FORMATS[to].several:
-        fitting = [name for name, each in FORMATS.items() if format_name in each.several]
-        where = f"several go into {', '.join(fitting)}" if fitting else "give one file at a time"
-        raise UsageError(f"{path}: holds {kind}, of which {to} takes one file, got {count}; {where}")

@@ -10,19 +10,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lfpiv_cli.files.export_formats import Content
 from lfpiv_cli.files.hdf5 import FILTERS, created, write_array, write_rows
 from lfpiv_cli.files.particle_file import CELLS, POSITION, TRAJECTORIES_FORMAT, UNITS, PointRows, Points, lines_of
 from lfpiv_cli.files.vtkhdf import create_vtk_group, mark_active, write_root, write_steps
 from lfpiv_cli.grid import Reference
-
-if TYPE_CHECKING:
-    from lfpiv_cli.files.export_formats import Content
 
 # VTK's XML files: images (`.vti`) and points (`.vtp`), for programs that do not read VTKHDF.
 #

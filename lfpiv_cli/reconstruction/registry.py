@@ -9,12 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import import_module
-from typing import TYPE_CHECKING, Literal
-
-if TYPE_CHECKING:
-    from lfpiv_cli.reconstruction.solvers import Image, Problem, Volume
-
-    Step = Callable[[Problem, Volume, Image, float], Volume]
+from typing import TYPE_CHECKING, Any, Literal
 
 
 @dataclass(frozen=True)
@@ -30,10 +25,10 @@ class Solver:
     step_at: str
     exponent: float = 1.0
 
-    def step(self) -> Step:
+    def step(self) -> Callable[..., Any]:
         """Return the step: a function of the problem, the volume, its projection and the relaxation."""
         module, _, name = self.step_at.partition(":")
-        step: Step = getattr(import_module(module), name)
+        step: Callable[..., Any] = getattr(import_module(module), name)
         return step
 
 

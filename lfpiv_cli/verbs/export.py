@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -10,9 +10,65 @@ from typing import Any
 from lfpiv_cli.console import CONSOLE, Console
 from lfpiv_cli.errors import InputError, UsageError
 from lfpiv_cli.files import atomic, export_vtk, provenance
-from lfpiv_cli.files.export_formats import FORMATS, Content, ensure_fits, read_content, write_netcdf
+from lfpiv_cli.files import export_formats as formats
+from lfpiv_cli.files.export_formats import Content, read_content, write_netcdf
+from lfpiv_cli.files.particle_file import TRAJECTORIES_FORMAT
+from lfpiv_cli.files.vtkhdf import VECTORS_FORMAT
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.names import ExportFormat
+
+
+@dataclass(frozen=True)
+class Format:
+    """A format: what follows the stem of its files, and what it takes.
+
+    Attributes
+    ----------
+    ending : of the file's name
+    takes : names of our formats
+    several : of these, those of which several times go into one file
+    write : writes one file; None where `export` says how, as times or records come into it
+    """
+
+    ending: str
+    takes: tuple[str, ...]
+    several: tuple[str, ...] = ()
+    write: Callable[[Path, Content], None] | None = None
+
+
+# A volume has millions of voxels: as rows of text it serves nobody.
+FORMATS: dict[ExportFormat, Format] = {
+    "netcdf": Format(".nc", formats.ON_GRIDS + formats.OF_POINTS, several=(VECTORS_FORMAT,)),
+    "tecplot": Format(".dat", formats.ON_GRIDS + formats.OF_POINTS, write=formats.write_tecplot),
+    "csv": Format(".csv", (VECTORS_FORMAT, *formats.OF_POINTS), write=formats.write_csv),
+    "mat": Format(".mat", formats.ON_GRIDS + formats.OF_POINTS, write=formats.write_mat),
+    "vti": Format(".vti", formats.ON_GRIDS, write=export_vtk.write_vti),
+    "vtp": Format(".vtp", formats.OF_POINTS, write=export_vtk.write_vtp),
+    "vtkhdf-series": Format("_series.vtkhdf", (*formats.ON_GRIDS, TRAJECTORIES_FORMAT), several=formats.ON_GRIDS),
+}
+
+
+def ensure_fits(path: Path, format_name: str, to: ExportFormat, count: int) -> None:
+    """Refuse what a format does not take, with the formats that do.
+
+    Parameters
+    ----------
+    path, format_name : of the first file and of what it holds
+    count : how many files there are
+
+    Raises
+    ------
+    InputError : the format takes no such file
+    UsageError : it takes one at a time
+    """
+    kind, fitting = formats.KINDS[format_name], [name for name, each in FORMATS.items() if format_name in each.takes]
+    if to not in fitting:
+        raise InputError(f"{path}: holds {kind}, which {to} does not take; {', '.join(fitting)} do")
+    if count > 1 and format_name not in FORMATS[to].several:
+        fitting = [name for name, each in FORMATS.items() if format_name in each.several]
+        where = f"several go into {', '.join(fitting)}" if fitting else "give one file at a time"
+        raise UsageError(f"{path}: holds {kind}, of which {to} takes one file, got {count}; {where}")
+
 
 # What the files of several times have to agree in, besides grid and arrays.
 SHARED = ("reference", "reference_z_mm", "dt_s", "voxel_mm", "window_voxel")

@@ -17,16 +17,15 @@ from lfpiv_cli.console import CONSOLE, Console
 from lfpiv_cli.errors import ConfigError, InputError, UsageError
 from lfpiv_cli.files import atomic, calibration_file, hdf5, images, inputs, pages, particle_file, vtkhdf, weights_file
 from lfpiv_cli.files.config import carried_config
-from lfpiv_cli.files.figures import FIGURES, describe, is_recording, recording_figures
 from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, TRACKS_FORMAT, TRAJECTORIES_FORMAT, Points
 from lfpiv_cli.files.weights_file import FORMAT, WeightsFile, open_weights
 from lfpiv_cli.flow.field import VectorField
 from lfpiv_cli.notice import written
 from lfpiv_cli.pictures import calibration as pictures
 from lfpiv_cli.pictures import points as of_points
-from lfpiv_cli.pictures import statistics as of_statistics
 from lfpiv_cli.pictures import vectors
 from lfpiv_cli.pictures.style import caption_of
+from lfpiv_cli.verbs.contents import FIGURES, describe, is_recording, recording_figures
 from lfpiv_cli.verbs.frames import residual_path
 
 if TYPE_CHECKING:
@@ -85,15 +84,15 @@ def of_vectors(
     if field.dt_s is not None:
         figures["gradients"] = partial(vectors.gradients_figure, field)
     if "convergence" in tables:  # of many pairs, whose mean these are
-        figures["moments"] = partial(of_statistics.moments_figure, field.grid, field.velocity, arrays)
-        figures["stresses"] = partial(of_statistics.stresses_figure, field.grid, arrays)
+        figures["moments"] = partial(of_points.moments_figure, field.grid, field.velocity, arrays)
+        figures["stresses"] = partial(of_points.stresses_figure, field.grid, arrays)
         if "profile" in tables:
             names = said["profile_components"].split(", ")
-            figures["profile"] = partial(of_statistics.profile_figure, said["profile"], names, tables["profile"])
+            figures["profile"] = partial(of_points.profile_figure, said["profile"], names, tables["profile"])
         spreads = [tables["convergence"][f"{name}_spread"] for name in ("velocity", "reynolds_stress")]
         if all((spread > 0.0).any() for spread in spreads):  # one pair tells none
             pairs = tables["convergence"]["pairs"]
-            figures["convergence"] = partial(of_statistics.convergence_figure, pairs, *spreads)
+            figures["convergence"] = partial(of_points.convergence_figure, pairs, *spreads)
     return figures
 
 

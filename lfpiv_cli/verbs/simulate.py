@@ -24,7 +24,7 @@ from lfpiv_cli.files.atomic import ensure_writable, write_json
 from lfpiv_cli.files.config import Config, load_rig
 from lfpiv_cli.files.images import write_tiff
 from lfpiv_cli.files.inputs import ensure_room
-from lfpiv_cli.files.particles import Particles, write_particles
+from lfpiv_cli.files.particle_file import Particles, write_particles
 from lfpiv_cli.files.provenance import record
 from lfpiv_cli.flow.windows import RoundWall
 from lfpiv_cli.grid import FOCAL_POINT, Grid, Reference

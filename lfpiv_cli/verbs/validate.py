@@ -16,7 +16,7 @@ from lfpiv_cli.files.atomic import ensure_writable, write_json
 from lfpiv_cli.files.config import Config, load_rig
 from lfpiv_cli.files.inputs import given
 from lfpiv_cli.files.pages import ensure_drawing, write_picture
-from lfpiv_cli.files.particles import MM_PER_M, read_particles
+from lfpiv_cli.files.particle_file import MM_PER_M, read_particles
 from lfpiv_cli.files.provenance import record
 from lfpiv_cli.files.sections_work import ColumnLimits, FlowSection
 from lfpiv_cli.flow.field import VectorField
