@@ -290,7 +290,8 @@ def run(
     try:
         return planned(chain) if options.dry_run else run_choice.take_all(chain)
     except OutputExistsError as error:
-        chain.overwrite = True
+        # Nothing is made any more: it is told what would be.
+        chain.overwrite, chain.options = True, replace(options, dry_run=True)
         raise OutputExistsError(f"{error}{with_overwrite(chain)}") from error
 
 
