@@ -159,6 +159,19 @@ def test_pose_of_exact_dots_is_exact_with_dots_missing_and_dirt(table2: Camera) 
     assert first[1] < -1.5
 
 
+def test_a_tilt_that_its_error_explains_changes_no_magnification(table2: Camera, rng: np.random.Generator) -> None:
+    """Of few dots whose depths are little known the slopes are errors, which always make the spacing longer."""
+    dots, found = dot_places(BOARD, 2.0, (0.0, 0.0), (0.5, -0.5)), []
+    for _ in range(20):
+        deep = dots + rng.normal(0.0, 1.0, (9, 3)) * (1e-5, 1e-5, 0.1)
+        pose = pose_of_dots(deep, np.full(dots.shape, 1e-3), -deep[:, :2], table2, BOARD)
+        found.append((abs(pose.magnification + 1.0), pose.magnification_sigma))
+    off, sigma = np.transpose(found)
+    # Slopes of 0.07 would make it 2e-3.
+    assert np.median(off) < 2e-4
+    assert np.sqrt(np.mean((off / sigma) ** 2)) < 1.5
+
+
 def test_dots_that_gaps_cut_off_belong_to_the_board_and_strays_do_not(table2: Camera, rng: np.random.Generator) -> None:
     # A missing row and a missing column leave four islands, and a stray dot lies in the middle.
     board = BoardGeometry((5, 5), 1.0, 0.2)
