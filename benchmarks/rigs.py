@@ -342,11 +342,11 @@ def verdict(outcome: Outcome) -> str:
         # Of an image that shows none, as it is said of it, nothing can be followed.
         empty = failed[0].command == "track" and "no-particles" in codes(outcome.steps)
         return "refused" if (failed[0].command in BEFORE_THE_WORK or empty) and not bug else "failed"
-    if not outcome.faults:
-        return "worked"
     # Nothing is stated that is wrong where no track was found.
     if "no-tracks" in codes(outcome.steps) and all("tracks of" in fault for fault in outcome.faults):
         return "refused"
+    if not outcome.faults:
+        return "worked"
     if outcome.wrong_value in BELIEVED:
         said, share, axes = BELIEVED[outcome.wrong_value]
         figures = outcome.figures

@@ -258,7 +258,8 @@ def test_verdicts_and_their_summary() -> None:
     assert outcome_of(fine, done, Step("correlate", 4, "no", [], 1.0)).verdict == "failed"
     # No track at all; an index that is off by as much as `check` says, and by more.
     lost = Step("track", 0, "", ["lfpiv: none [no-tracks]"], 1.0)
-    assert outcome_of(fine | {"tracks": 0.0}, lost).verdict == "refused"
+    for staying in (45.0, 0.0):
+        assert outcome_of(fine | {"tracks": 0.0, "staying": staying}, lost).verdict == "refused"
     assert outcome_of(fine | {"tracks": 0.0, "slope_u": 1.03}, lost).verdict == "warned"
     said = "no snapshot tells media.fluid of 1.33: 1% more makes depths and w 1% larger"
     for slope, line, expected in ((1.05, said, "unknown"), (1.05, "", "silent"), (1.09, said, "silent")):
