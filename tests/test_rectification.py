@@ -136,6 +136,19 @@ def test_the_scene_turns_with_the_image(table2: Camera, column_axis: str) -> Non
     np.testing.assert_allclose(back, world, atol=1e-12)
 
 
+@pytest.mark.parametrize("layout", ["square", "hexagonal"])
+def test_a_nearest_pixel_lies_beside_its_place_as_it_does_in_its_lens_image(layout: str) -> None:
+    rectification = Rectification(known_fit(turned_lattice(layout)), SHAPE)
+    row, column = np.indices(SHAPE)
+    raw = np.stack([rectification.nearest(each) for each in (column, row)], axis=-1)
+    lens = rectification.lattice_px.nearest(np.stack([column, row], axis=-1))
+    from_centre = (raw - rectification.fit.centres(lens)) @ turn_matrix(rectification.rotation_rad)
+    place = rectification.lattice_px.points(lens) + from_centre - np.stack([column, row], axis=-1)
+    inside = rectification.inside
+    np.testing.assert_allclose(rectification.off_px[inside], place[inside], atol=1e-4)
+    assert 0.4 < np.abs(place[inside]).max() < 0.75
+
+
 def test_transmission_is_one_in_the_middle_and_zero_in_the_gaps() -> None:
     lattice = turned_lattice("square", 0.0)
     row, column = np.indices(SHAPE)

@@ -190,6 +190,7 @@ def locate_board(
     rotation_rad: float = 0.0,
     transmission: Singles | None = None,
     light: WaveLight | None = None,
+    off_px: Singles | None = None,
 ) -> BoardPose:
     """Find the dots of a board in depth by fitting each one's rendering, and the board through them.
 
@@ -200,6 +201,8 @@ def locate_board(
     rotation_rad : angle that rectification took out
     transmission : (rows, columns) share of light that pixels pass, rectified; default: all the same
     light : waves, behind square microlenses; default: rays
+    off_px : (rows, columns, 2) where the pixels of image and transmission lie beside their places, column first;
+        default: there
 
     Raises
     ------
@@ -221,7 +224,7 @@ def locate_board(
         return pose_of_dots(places, sigmas, array, camera, board, numbers, medium), array
 
     try:
-        look = LOOKS[board.pattern](image, passed, camera, board, medium)
+        look = replace(LOOKS[board.pattern](image, passed, camera, board, medium), off_px=off_px)
         # Again with the magnification and the distortion that the first pose tells. Rays are near enough for these;
         # waves then take one look more.
         for _ in range(LENS_ROUNDS):

@@ -9,7 +9,7 @@ Axes: image axes (x along the columns, y along the rows), mm; rectified pictures
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from typing import ClassVar
 
@@ -146,11 +146,13 @@ class Look(ABC):
     ----------
     signal, passed : (rows, columns) light, dots bright, and the share of it that pixels pass
     medium : what the target stands in
+    off_px : see `shape_fit.pixels_near`
     """
 
     signal: Floats
     passed: Singles
     medium: Media
+    off_px: Singles | None = field(default=None, kw_only=True)
 
     # More pixels than these make a fit slower and hardly better: the model's own errors are larger than their noise.
     most_pixels: ClassVar[int]
@@ -195,7 +197,8 @@ class Look(ABC):
         """Fit a point's shape from a first guess (3,), by rays or by waves; None where that leads to none."""
         z, medium = float(start_mm[2]), self.medium
         reach = self.reach_mm(camera, board, z)
-        near = pixels_near((self.signal, self.passed), camera, medium, start_mm, reach, self.most_pixels)
+        picture = self.signal, self.passed
+        near = pixels_near(picture, camera, medium, start_mm, reach, self.most_pixels, self.off_px)
         if near is None:
             return None
         # Moves that change the light alike: sideways, and in depth what moves the rim's rays as far.

@@ -90,6 +90,25 @@ class Rectification:
         share_out(sample_rows, len(raw), coefficients, self.shift_px, self.inside, rectified)
         return rectified
 
+    def nearest(self, image: ArrayLike) -> Singles:
+        """Return the rectified image (rows, columns): for each pixel the nearest raw one, 0 outside the sensor."""
+        column, row = self._nearest_px.T.astype(np.int64)
+        return np.where(self.inside, np.asarray(image, dtype=np.float32)[row.T, column.T], np.float32(0.0))
+
+    @property
+    def off_px(self) -> Singles:
+        """Where the pixels of `nearest` lie beside their places: (rows, columns, 2), column first."""
+        rows, columns = np.indices(self.image_shape, dtype=np.float32)
+        off = self._nearest_px - np.stack([columns, rows], axis=-1) - self.shift_px
+        return np.asarray(off @ turn_matrix(self.rotation_rad), dtype=np.float32)
+
+    @property
+    def _nearest_px(self) -> Singles:
+        """The raw pixel (rows, columns, 2) nearest to each rectified one, column first, on the sensor."""
+        rows, columns = np.indices(self.image_shape, dtype=np.float32)
+        last = np.array(self.image_shape[::-1], dtype=np.float32) - 1
+        return np.clip(np.rint(np.stack([columns, rows], axis=-1) + self.shift_px), 0, last)
+
     def to_world(self, points: ArrayLike, column_axis: ColumnAxis = "x") -> Floats:
         """Turn lateral world coordinates (..., 2 or 3) from the rectified frame to the raw sensor's axes."""
         return turned(points, self.rotation_rad if column_axis == "x" else -self.rotation_rad)

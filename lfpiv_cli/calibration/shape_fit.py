@@ -16,8 +16,9 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
-from lfpiv_cli.arrays import Floats, Integers, Singles
+from lfpiv_cli.arrays import Floats, Singles
 from lfpiv_cli.optics.camera import Camera, Lattice, nearest_point, undistorted
 from lfpiv_cli.optics.media import Media, equivalent_object_distance
 
@@ -157,7 +158,9 @@ class PixelRays(NamedTuple):
     ideal_mm: Floats
 
 
-def pixel_rays(camera: Camera, column: Integers, row: Integers) -> PixelRays:
+def pixel_rays(
+    camera: Camera, column: NDArray[np.integer | np.floating], row: NDArray[np.integer | np.floating]
+) -> PixelRays:
     """Return the rays of pixels: the microlens of a pixel is that of the nearest micro-image."""
     px = np.stack([column, row], axis=-1).astype(np.float64)
     micro_images = camera.micro_image_lattice_px()
@@ -342,7 +345,13 @@ class NearPixels(NamedTuple):
 
 
 def pixels_near(
-    picture: tuple[Floats, Singles], camera: Camera, media: Media, start_mm: Floats, reach_mm: float, most: int
+    picture: tuple[Floats, Singles],
+    camera: Camera,
+    media: Media,
+    start_mm: Floats,
+    reach_mm: float,
+    most: int,
+    off_px: Singles | None = None,
 ) -> NearPixels | None:
     """Return the pixels that see the plane of a point within `reach_mm` of it; None where the sensor holds too few.
 
@@ -350,6 +359,7 @@ def pixels_near(
     ----------
     picture : light and the share of it that pixels pass, (rows, columns) each
     start_mm : (3,) the point, image axes
+    off_px : (rows, columns, 2) where pixels lie beside their places in the picture, column first; None: there
     """
     z = float(start_mm[2])
     signal, passed = picture
@@ -362,7 +372,8 @@ def pixels_near(
     low = np.maximum(np.floor(middle - half), 0).astype(np.int64)
     high = np.minimum(np.ceil(middle + half) + 1, [camera.columns, camera.rows]).astype(np.int64)
     row, column = (axis.ravel() for axis in np.mgrid[low[1] : high[1], low[0] : high[0]])
-    rays = pixel_rays(camera, column, row)
+    beside = np.zeros(2) if off_px is None else off_px[row, column]
+    rays = pixel_rays(camera, column + beside[..., 0], row + beside[..., 1])
     near = np.hypot(*(scene_points(rays, camera, media, z) - start_mm[:2]).T) <= reach_mm
     rim = RIM_PER_PATCH * camera.pixel_mm * camera.image_distance_mm / camera.microlens_distance_mm
     through = np.hypot(*lens_crossings(rays, camera).T) <= camera.aperture_radius_mm - rim
