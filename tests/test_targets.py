@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from lfpiv_cli.arrays import Singles
-from lfpiv_cli.calibration.board import another_kind, dot_signal, locate_board, sentence
+from lfpiv_cli.calibration.board import another_kind, chessboard, dot_signal, locate_board, sentence
 from lfpiv_cli.calibration.board_pose import BoardGeometry, BoardPose, off_focus_mm, pose_of_dots, upright_numbers
 from lfpiv_cli.calibration.corners import quadrant_shares
 from lfpiv_cli.calibration.shape_fit import lens_cell
@@ -137,6 +137,17 @@ def test_another_target_is_named(table2: Camera, shown: BoardGeometry, said: Boa
     camera = large(table2) if shown.pattern == "charuco" else small(table2)
     with pytest.raises(InputError, match=expected):
         locate_board(at_one_mm(shown), camera, said, Media())
+
+
+def test_dots_out_of_focus_are_no_chessboard_on_a_corner() -> None:
+    row, column = np.indices((400, 500))
+    waves = np.cos(2.0 * np.pi * column / 60.0) + np.cos(2.0 * np.pi * row / 60.0)
+    picture = np.rint(128.0 + 60.0 * waves).astype(np.uint8)
+    found = chessboard(picture)
+    assert found is not None
+    assert "chessboard of" in found
+    assert chessboard(picture, 60.0 * np.sqrt(0.5)) is None
+    assert chessboard(picture, 60.0) == found
 
 
 def test_boards_that_are_none_are_refused(table2: Camera, rng: np.random.Generator) -> None:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from lfpiv_cli.arrays import Floats, Singles
 from lfpiv_cli.calibration.board_pose import BoardGeometry, BoardPose, on_the_grid, pose_of_dots
-from lfpiv_cli.calibration.corners import Look, enlarged_view, evenly_lit, first_corners
+from lfpiv_cli.calibration.corners import Look, ViewGrid, enlarged_view, evenly_lit, first_corners
 from lfpiv_cli.calibration.shape_fit import PointShape, covered_shares
 from lfpiv_cli.calibration.views import alternating, described, refocusing
 from lfpiv_cli.calibration.wave_shapes import WaveLight, disc_strips
@@ -43,8 +43,11 @@ EVEN_SHARE = 0.8
 
 def another_kind(signal: Floats, camera: Camera, board: BoardGeometry) -> str | None:
     """Return a sentence that names the target in an evenly lit picture where it is not the board's; else None."""
-    picture, _ = enlarged_view(signal, camera)
-    for pattern, look in LOOKS_LIKE.items():
+    picture, scale = enlarged_view(signal, camera)
+    # Out of focus dots and the gaps between them are the squares of a chessboard that stands on a corner.
+    per_mm = abs(camera.magnification) / float(ViewGrid.of(camera).step_mm[0]) * float(scale[0])
+    between = np.sqrt(0.5) * board.spacing_mm * per_mm if board.pattern == "dots" else None
+    for pattern, look in (LOOKS_LIKE | {"chessboard": partial(chessboard, not_px=between)}).items():
         if (found := look(picture)) is not None:
             return None if found == described(board) else sentence(found, pattern, board)
     return None
@@ -75,14 +78,16 @@ def markers(picture: NDArray[np.uint8]) -> str | None:
     return None
 
 
-def chessboard(picture: NDArray[np.uint8]) -> str | None:
-    """Return what a picture of a chessboard shows, with the number of its squares."""
+def chessboard(picture: NDArray[np.uint8], not_px: float | None = None) -> str | None:
+    """Return what a picture of a chessboard shows, with the number of its squares, if these have not a given side."""
     flags = cv2.CALIB_CB_LARGER | cv2.CALIB_CB_EXHAUSTIVE
     there, corners, meta = cv2.findChessboardCornersSBWithMeta(picture, FEWEST_CORNERS, flags)
     if not there or meta is None:
         return None
     shape = (int(meta.shape[0]), int(meta.shape[1]))
-    if not alternating(picture, np.asarray(corners, dtype=np.float64).reshape(*shape, 2)):
+    places = np.asarray(corners, dtype=np.float64).reshape(*shape, 2)
+    side = float(np.mean(np.hypot(*np.moveaxis(np.diff(places, axis=1), -1, 0))))
+    if not alternating(picture, places) or (not_px is not None and abs(side / not_px - 1.0) < SAME_DISTANCE):
         return None
     down, across = (n + 1 for n in shape)
     return f"a chessboard of {max(across, down)} x {min(across, down)} squares"
