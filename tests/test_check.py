@@ -18,7 +18,6 @@ from lfpiv_cli.calibration.model import Calibration, Channel
 from lfpiv_cli.cli.main import cli
 from lfpiv_cli.files.config import Config
 from lfpiv_cli.files.images import write_tiff
-from lfpiv_cli.files.rig_numbers import RigNumbers, rig_text, tree_of
 from lfpiv_cli.optics.camera import Camera, Lattice
 from lfpiv_cli.optics.media import Media
 from lfpiv_cli.optics.tracing import ObjectSpace
@@ -30,6 +29,7 @@ from lfpiv_cli.validation.planning import Tracer, errors_alone_mm, errors_by_dep
 from lfpiv_cli.validation.volume import pairs_of
 from lfpiv_cli.verbs.check import Pictures, image_lines, lattice_of
 from lfpiv_cli.verbs.checks import Line, worst
+from lfpiv_cli.verbs.init import RigNumbers, rig_text, tree_of
 from lfpiv_cli.verbs.particles import light_of
 from lfpiv_cli.verbs.planning import believed_line, bench_of, diffraction_line, rig_figures, rig_lines, windows_line
 from tests.commands import WATER

@@ -357,7 +357,7 @@ def test_work_that_does_not_fit_is_refused_before_any(
 @pytest.mark.thorough
 def test_weights_that_the_disk_has_no_room_for_are_not_begun(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     usage = shutil.disk_usage(tmp_path)
-    monkeypatch.setattr(inputs.shutil, "disk_usage", lambda _: usage._replace(free=1_000))
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: usage._replace(free=1_000))
     rig = sample_rig(tmp_path, AT_FOCUS)
     code, said = ended("build-weights", rig, "-o", tmp_path / "w.h5")
     assert (code, "w.h5: needs 0.00 GB, and 0.00 GB are free on the disk" in said) == (7, True), said

@@ -22,8 +22,8 @@ import lfpiv_cli as lf
 from lfpiv_cli.cli.options import print_json
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.files import recording_formats as formats
-from lfpiv_cli.files.batch import ensure_verified
 from lfpiv_cli.files.images import count_pages, read_image, read_single, write_tiff
+from lfpiv_cli.files.provenance import ensure_verified
 from tests import camera_files
 from tests.commands import CONFIG, ROOT, SAMPLE, refused
 from tests.hostile_files import ended

@@ -13,13 +13,12 @@ from click.testing import CliRunner, Result
 from lfpiv_cli.cli.main import cli
 from lfpiv_cli.errors import ConfigError, OutputExistsError, UsageError
 from lfpiv_cli.files.config import Config, load_rig
-from lfpiv_cli.files.rig_numbers import LATTICES, RigNumbers, rig_text, schema, tree_of
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.validation import planning
 from lfpiv_cli.validation.planning import half_view_mm
 from lfpiv_cli.verbs.build_weights import plan_of
 from lfpiv_cli.verbs.calibrate import CalibrateOptions, calibrate_snapshot
-from lfpiv_cli.verbs.init import SCHEMA_NAME, InitOptions, init
+from lfpiv_cli.verbs.init import LATTICES, SCHEMA_NAME, InitOptions, RigNumbers, init, rig_text, schema, tree_of
 from lfpiv_cli.verbs.planning import bench_of, windows_line
 from lfpiv_cli.weights.columns import seen_share
 from tests.commands import ROOT

@@ -25,7 +25,7 @@ from lfpiv_cli.optics.media import Media
 from lfpiv_cli.optics.shapes import HeightMap, ScenePose
 from lfpiv_cli.optics.surfaces import Cylinder, Plane, Sphere, TiltedPlane
 from lfpiv_cli.optics.tracing import ObjectSpace
-from lfpiv_cli.verbs import validate, validate_board
+from lfpiv_cli.verbs import validate
 from lfpiv_cli.verbs.build_weights import plan_of, weights_of
 from lfpiv_cli.verbs.particles import searchable
 from lfpiv_cli.verbs.planning import bench_of
@@ -212,7 +212,7 @@ def test_what_knows_plane_windows_alone_refuses_a_scene(configured: Callable[[st
     config = configured(RIG + TUBE + flow)
     for what, work in (
         ("planning an experiment", lambda: bench_of(config, None)),
-        ("validating boards", lambda: validate_board.bench_of(config, "ideal")),
+        ("validating boards", lambda: validate.bench_of(config, "ideal")),
         ("this command", config.window_model),
     ):
         with pytest.raises(ConfigError, match=f"rig.yaml: scene: {what} is possible through plane windows"):

@@ -367,7 +367,7 @@ def common_options(command: Callable[..., dict[str, Any]]) -> Callable[..., None
         try:
             given = {name: value for name, value in arguments.items() if value is not None}
             if verify is not None:
-                from lfpiv_cli.files.batch import ensure_verified
+                from lfpiv_cli.files.provenance import ensure_verified
 
                 # All that it reads; a text may name a file, too.
                 read = _flat(value for name, value in given.items() if name not in OUTPUTS)

@@ -97,8 +97,7 @@ def validate(
         return validate_paper(output, PaperOptions(size=size, **chosen), **common)
     if config is None:
         raise click.UsageError(f"validate {what} needs a CONFIG")
-    module = "validate_board" if what == "board" else "validate"
-    stage = getattr(import_module(f"lfpiv_cli.verbs.{module}"), f"validate_{what}")
+    stage = getattr(import_module("lfpiv_cli.verbs.validate"), f"validate_{what}")
     return cast(dict[str, Any], stage(config, output, **common, **chosen))
 
 

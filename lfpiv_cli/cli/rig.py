@@ -17,7 +17,7 @@ from lfpiv_cli.errors import UsageError
 from lfpiv_cli.names import KnownCamera, Method, Refraction, Sampling
 
 if TYPE_CHECKING:
-    from lfpiv_cli.files.rig_numbers import RigNumbers
+    from lfpiv_cli.verbs.init import RigNumbers
 
 
 @command("build-weights")
@@ -169,7 +169,7 @@ def check() -> None:
 
 def _asked() -> RigNumbers:
     """Ask for the numbers of a rig; each default follows from the answers before it."""
-    from lfpiv_cli.files.rig_numbers import RigNumbers
+    from lfpiv_cli.verbs.init import RigNumbers
 
     plain = RigNumbers()
     answers: dict[str, Any] = {

@@ -16,11 +16,17 @@ from typing import Any
 
 from lfpiv_cli.errors import InputError, OutputExistsError, UsageError
 from lfpiv_cli.files.atomic import ensure_apart, ensure_writable, folded
-from lfpiv_cli.files.hdf5 import read_whole, replace_provenance
-from lfpiv_cli.files.images import count_pages, files_beside, format_of, frames
-from lfpiv_cli.files.inputs import content_of, ensure_regular_file, reading_from, split_part
+from lfpiv_cli.files.hdf5 import read_whole
+from lfpiv_cli.files.images import count_pages, format_of, frames
+from lfpiv_cli.files.inputs import content_of, reading_from, split_part
 from lfpiv_cli.files.pairing import Seen
-from lfpiv_cli.files.provenance import differences, earlier_record, same_result, sha256, without_warnings
+from lfpiv_cli.files.provenance import (
+    differences,
+    earlier_record,
+    replace_provenance,
+    same_result,
+    without_warnings,
+)
 from lfpiv_cli.names import InputKind
 
 VTKHDF_SUFFIX = ".vtkhdf"
@@ -294,60 +300,6 @@ def results_seen(paths: Sequence[Path]) -> list[Seen]:
     if len({(each.stem, each.page) for each in seen}) == len({each.image or each.path for each in seen}):
         return seen
     return [replace(each, image=other.image) for each, other in zip(own, seen, strict=True)]
-
-
-# Inputs against a list of their SHA-256, as `sha256sum` writes it: most cameras' formats have no check sum.
-
-# `sha256sum` writes a star before the names of files that are read as bytes.
-LINE = re.compile(r"([0-9a-fA-F]{64}) [ *](.+)")
-LARGEST_LIST_BYTES = 2**28
-
-
-def ensure_verified(listed: Path, inputs: Iterable[Path]) -> int:
-    """Refuse inputs that are not as a list says, or not in it; return how many files were read for that.
-
-    Parameters
-    ----------
-    listed : the list; names in it count from its folder
-    inputs : files, and folders of which all that is listed is asked
-    """
-    expected = _sums_in(listed)
-    given = [split_part(path)[0] for path in inputs]
-    read = [each for path in given for each in (path, *(() if os.path.isdir(path) else files_beside(path)))]
-    # The name that each file was given under, by its resolved name.
-    asked: dict[Path, Path] = {}
-    for path in read:
-        resolved = path.resolve()
-        inside = [file for file in expected if resolved in file.parents] if os.path.isdir(resolved) else [resolved]
-        if not inside or (inside == [resolved] and resolved not in expected):
-            raise InputError(f"{path}: is not in {listed}, which lists {len(expected)} files")
-        asked |= {file: path if file == resolved else file for file in inside}
-    for file, name in asked.items():
-        found = sha256(file)
-        if found != expected[file]:
-            raise InputError(
-                f"{name}: has the SHA-256 {found}, {listed} says {expected[file]}: it is damaged, or another"
-            )
-    return len(asked)
-
-
-def _sums_in(listed: Path) -> dict[Path, str]:
-    """Return the SHA-256 of each file in a list, by its resolved name."""
-    size = ensure_regular_file(listed)
-    if size > LARGEST_LIST_BYTES:
-        raise InputError(f"{listed}: has {size} bytes, expected a list of at most {LARGEST_LIST_BYTES}")
-    lines = content_of(listed).decode("utf-8", errors="surrogateescape").splitlines()
-    found: dict[Path, str] = {}
-    for number, line in enumerate(lines, 1):
-        if not line.strip() or line.startswith("#"):
-            continue
-        match = LINE.fullmatch(line)
-        if match is None:
-            raise InputError(f"{listed}:{number}: is no line of sha256sum: 64 digits, two spaces, a file's name")
-        name = (listed.parent / match[2]).resolve()
-        if found.setdefault(name, match[1].lower()) != match[1].lower():
-            raise InputError(f"{listed}:{number}: {match[2]} has another SHA-256 further above")
-    return found
 
 
 # Folders that a camera, or another command, is still filling: files are taken when they are complete, in order.

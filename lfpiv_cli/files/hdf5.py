@@ -15,7 +15,6 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import lru_cache
@@ -241,20 +240,6 @@ def write_header(file: h5py.File, format_name: str, format_version: int, provena
     file.attrs["format"] = np.bytes_(format_name)
     file.attrs["format_version"] = np.int64(format_version)
     file.attrs["provenance"] = np.bytes_(json.dumps(provenance, allow_nan=False))
-
-
-def replace_provenance(path: Path, provenance: Mapping[str, Any]) -> None:
-    """Give a file another record, its data as they are."""
-
-    def check(temporary: Path) -> None:
-        with open_h5(temporary) as file:
-            read_provenance(file)
-
-    with written_atomically(path, overwrite=True, check=check) as temporary:
-        shutil.copyfile(path, temporary)
-        with h5py.File(temporary, "r+", libver=LIBRARY_VERSIONS) as file:
-            file.attrs["provenance"] = np.bytes_(json.dumps(provenance, allow_nan=False))
-            write_digest(file)
 
 
 def read_provenance(file: h5py.File) -> dict[str, Any]:

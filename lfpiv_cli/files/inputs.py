@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import re
-import shutil
 import stat
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -183,13 +182,6 @@ def ensure_room(held_bytes: float, work: str, remedy: str = "a smaller volume, o
                 f"too little memory: {work} needs {_gb(PROGRAM_BYTES + held_bytes)} GB, {_gb(held_bytes)} of them for "
                 f"its arrays, and {_gb(left)} GB are left of {by}; {remedy}"
             )
-
-
-def ensure_disk(file_bytes: float, target: Path) -> None:
-    """Refuse to begin what makes a file that the disk has no room for."""
-    left = shutil.disk_usage(target.parent).free
-    if file_bytes > left:
-        raise OutputError(f"{target}: needs {_gb(file_bytes)} GB, and {_gb(left)} GB are free on the disk")
 
 
 def _told(path: Path) -> dict[str, int]:

@@ -114,12 +114,6 @@ class Page:
 
 def write_pages(page: Page, targets: Iterable[Path], overwrite: bool) -> None:
     """Write a page as HTML with its pictures inside, or as Markdown that links to them, as each target's name ends."""
-    for target in targets:
-        write_text(target, _rendered(page, target), overwrite)
-
-
-def _rendered(page: Page, target: Path) -> str:
-    """Return a page in the language that a file's name ends in."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
     places = Environment(
@@ -134,6 +128,8 @@ def _rendered(page: Page, target: Path) -> str:
         # A PNG file as an address that holds the picture itself.
         "data_uri": lambda path: "data:image/png;base64," + base64.b64encode(content_of(path)).decode("ascii"),
         "cell": lambda text: text.replace("|", "\\|"),
-        "relative": lambda path: path.relative_to(target.parent).as_posix(),
     }
-    return places.get_template(f"page{target.suffix}").render(page=page)
+    for target in targets:
+        folder = target.parent
+        places.filters["relative"] = lambda path, folder=folder: path.relative_to(folder).as_posix()
+        write_text(target, places.get_template(f"page{target.suffix}").render(page=page), overwrite)

@@ -1,9 +1,8 @@
 """Particles and tracks as VTKHDF PolyData, which ParaView opens: one vertex for each, a line for each long track.
 
-What is true of simulated particles is a list of its own, as NumPy's npz: `position_mm` (n, 3) and `velocity_mm_s`
-(n, 3), float32, world axes (x, y, z), z from the nominal focal point. Those of a simulated pair or sequence are at its
-middle, and there are `brightness` (n,) and `diameter_mm` (n,), and of each frame `frame_position_mm` (frames, n, 3) and
-`frame_brightness` (frames, n), 0 where there is no light.
+Simulated particles are a list of its own, as NumPy's npz: `position_mm` and `velocity_mm_s` (n, 3), float32, at the
+middle of a pair or sequence, z from the nominal focal point; `brightness` and `diameter_mm` (n,); of each frame
+`frame_position_mm` (frames, n, 3) and `frame_brightness` (frames, n), 0 where there is no light.
 
 Layout: the arrays lie at the root (`position_mm` (n, 3) and one array of n rows for each quantity, unit in the
 attribute `units`) and are linked under `/VTKHDF`, so that readers of HDF5 and of VTK find the same data. Positions are
@@ -86,33 +85,26 @@ def read_particles(path: Path) -> Particles:
             for entry in stored.infolist():
                 stored.open(entry).close()
             there = set(stored.namelist())
-            told_names = [name for name in UNTOLD if f"{name}.npy" in there]
+            names = ["position_mm", "velocity_mm_s", *(name for name in UNTOLD if f"{name}.npy" in there)]
             # Places first, by which the size of the others is judged.
-            for name in sorted(
-                ["position_mm", "velocity_mm_s", *told_names], key=lambda name: not name.endswith(PLACES)
-            ):
+            for name in sorted(names, key=lambda name: not name.endswith(PLACES)):
                 arrays[name] = _read_array(stored, name, max((array.size for array in arrays.values()), default=0))
     except Exception as error:  # a damaged archive can raise anything in zipfile and NumPy
         raise InputError(f"{path}: not a list of particles: {reason(error)}") from error
     position, velocity = arrays.pop("position_mm"), arrays.pop("velocity_mm_s")
-    reported = arrays
     if position.ndim != 2 or position.shape[1:] != (3,) or position.shape != velocity.shape or not position.size:
         raise InputError(f"{path}: positions {position.shape} and velocities {velocity.shape}, expected twice (n, 3)")
-    reported.setdefault("brightness", np.ones(len(position)))
-    frames = reported["frame_position_mm"].shape[:1] if "frame_position_mm" in reported else ()
-    for name, array in reported.items():
+    arrays.setdefault("brightness", np.ones(len(position)))
+    frames = arrays["frame_position_mm"].shape[:1] if "frame_position_mm" in arrays else ()
+    for name, array in arrays.items():
         of_frames = frames if name.startswith("frame") else ()
         expected = of_frames + (position.shape if name == "frame_position_mm" else position.shape[:1])
         if array.shape != expected:
             raise InputError(f"{path}: {name} {array.shape} for {len(position)} particles, expected {expected}")
-    if not all((np.abs(values) < LARGEST_VALUE).all() for values in (position, velocity, *reported.values())):
-        raise InputError(
-            f"{path}: a position, velocity, brightness or diameter is not a finite number below "
-            f"{written(LARGEST_VALUE)}"
-        )
-    return Particles(
-        position, velocity / MM_PER_M, reported["brightness"], *(reported.get(name) for name in UNTOLD[1:])
-    )
+    if not all((np.abs(values) < LARGEST_VALUE).all() for values in (position, velocity, *arrays.values())):
+        what = f"is not a finite number below {written(LARGEST_VALUE)}"
+        raise InputError(f"{path}: a position, velocity, brightness or diameter {what}")
+    return Particles(position, velocity / MM_PER_M, arrays["brightness"], *map(arrays.get, UNTOLD[1:]))
 
 
 def _read_array(stored: zipfile.ZipFile, name: str, largest: int) -> NDArray[np.float64]:
@@ -126,8 +118,7 @@ def _read_array(stored: zipfile.ZipFile, name: str, largest: int) -> NDArray[np.
     ------
     ValueError : it is of no real numbers, of another size than it declares, or too large
     """
-    entry = stored.getinfo(f"{name}.npy")
-    with stored.open(entry) as file:
+    with stored.open(entry := stored.getinfo(f"{name}.npy")) as file:
         if np.lib.format.read_magic(file) != (1, 0):
             raise ValueError(f"{name} has another version of NumPy's format than 1.0")
         shape, _, dtype = np.lib.format.read_array_header_1_0(file)

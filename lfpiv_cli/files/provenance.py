@@ -9,6 +9,8 @@ import hashlib
 import json
 import os
 import platform
+import re
+import shutil
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, lru_cache
@@ -18,13 +20,14 @@ from types import MappingProxyType
 from typing import Any
 
 import h5py
+import numpy as np
 
 import lfpiv_cli
 from lfpiv_cli.errors import InputError
-from lfpiv_cli.files.atomic import without_nan
-from lfpiv_cli.files.hdf5 import open_h5, read_provenance
+from lfpiv_cli.files.atomic import without_nan, written_atomically
+from lfpiv_cli.files.hdf5 import LIBRARY_VERSIONS, open_h5, read_provenance, write_digest
 from lfpiv_cli.files.images import files_beside
-from lfpiv_cli.files.inputs import ensure_regular_file, opened, reading_from, split_part
+from lfpiv_cli.files.inputs import content_of, ensure_regular_file, opened, reading_from, split_part
 from lfpiv_cli.notice import Notice
 
 # What has changed is not written out where it takes more characters.
@@ -131,6 +134,20 @@ def with_warnings(made: Mapping[str, Any], notices: Iterable[Notice]) -> dict[st
 def without_warnings(made: Mapping[str, Any]) -> dict[str, Any]:
     """Return a record as it stood before the work: what it was made of and how."""
     return {name: value for name, value in made.items() if name != "warnings"}
+
+
+def replace_provenance(path: Path, provenance: Mapping[str, Any]) -> None:
+    """Give a file another record, its data as they are."""
+
+    def check(temporary: Path) -> None:
+        with open_h5(temporary) as file:
+            read_provenance(file)
+
+    with written_atomically(path, overwrite=True, check=check) as temporary:
+        shutil.copyfile(path, temporary)
+        with h5py.File(temporary, "r+", libver=LIBRARY_VERSIONS) as file:
+            file.attrs["provenance"] = np.bytes_(json.dumps(provenance, allow_nan=False))
+            write_digest(file)
 
 
 def also_used_as(made: Mapping[str, Any], role: str) -> str | None:
@@ -315,3 +332,57 @@ def _earlier_record(path: Path, _size: int, _modified_ns: int) -> str | None:
         return None
     with open_h5(path) as file:
         return json.dumps(read_provenance(file)) if "provenance" in file.attrs else None
+
+
+# Inputs against a list of their SHA-256, as `sha256sum` writes it: most cameras' formats have no check sum.
+
+# `sha256sum` writes a star before the names of files that are read as bytes.
+LINE = re.compile(r"([0-9a-fA-F]{64}) [ *](.+)")
+LARGEST_LIST_BYTES = 2**28
+
+
+def ensure_verified(listed: Path, inputs: Iterable[Path]) -> int:
+    """Refuse inputs that are not as a list says, or not in it; return how many files were read for that.
+
+    Parameters
+    ----------
+    listed : the list; names in it count from its folder
+    inputs : files, and folders of which all that is listed is asked
+    """
+    expected = _sums_in(listed)
+    given = [split_part(path)[0] for path in inputs]
+    read = [each for path in given for each in (path, *(() if os.path.isdir(path) else files_beside(path)))]
+    # The name that each file was given under, by its resolved name.
+    asked: dict[Path, Path] = {}
+    for path in read:
+        resolved = path.resolve()
+        inside = [file for file in expected if resolved in file.parents] if os.path.isdir(resolved) else [resolved]
+        if not inside or (inside == [resolved] and resolved not in expected):
+            raise InputError(f"{path}: is not in {listed}, which lists {len(expected)} files")
+        asked |= {file: path if file == resolved else file for file in inside}
+    for file, name in asked.items():
+        found = sha256(file)
+        if found != expected[file]:
+            raise InputError(
+                f"{name}: has the SHA-256 {found}, {listed} says {expected[file]}: it is damaged, or another"
+            )
+    return len(asked)
+
+
+def _sums_in(listed: Path) -> dict[Path, str]:
+    """Return the SHA-256 of each file in a list, by its resolved name."""
+    size = ensure_regular_file(listed)
+    if size > LARGEST_LIST_BYTES:
+        raise InputError(f"{listed}: has {size} bytes, expected a list of at most {LARGEST_LIST_BYTES}")
+    lines = content_of(listed).decode("utf-8", errors="surrogateescape").splitlines()
+    found: dict[Path, str] = {}
+    for number, line in enumerate(lines, 1):
+        if not line.strip() or line.startswith("#"):
+            continue
+        match = LINE.fullmatch(line)
+        if match is None:
+            raise InputError(f"{listed}:{number}: is no line of sha256sum: 64 digits, two spaces, a file's name")
+        name = (listed.parent / match[2]).resolve()
+        if found.setdefault(name, match[1].lower()) != match[1].lower():
+            raise InputError(f"{listed}:{number}: {match[2]} has another SHA-256 further above")
+    return found

@@ -22,8 +22,9 @@ from lfpiv_cli.notice import written
 from lfpiv_cli.paper.parts import AS_PAPER, BOARD, Drawing, Findings, Row, Work, merged, sections
 from lfpiv_cli.paper.pictures import board_view, centres_figure, elongation_figure, location_figure, views_figure
 from lfpiv_cli.validation import board as of_boards
+from lfpiv_cli.validation.board import BoardBench, BoardSolver, board_in
 from lfpiv_cli.verbs.simulate import placement_of
-from lfpiv_cli.verbs.validate_board import BoardBench, BoardSolver, bench_of, board_in, board_solver
+from lfpiv_cli.verbs.validate import bench_of, board_solver
 
 Half = Literal["ideal", "recorded"]
 Figures = dict[str, dict[str, Any]]

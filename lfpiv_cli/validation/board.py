@@ -7,17 +7,26 @@ else is measured.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from scipy.optimize import least_squares
 
 from lfpiv_cli.arrays import Floats, Singles
+from lfpiv_cli.calibration.dlfc import fit_rays
+from lfpiv_cli.calibration.model import Rig
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.notice import written
+from lfpiv_cli.optics.tracing import ObjectSpace
 from lfpiv_cli.pictures.style import Figure, new_panels, styled
+from lfpiv_cli.reconstruction.images import Image, Mask
+from lfpiv_cli.reconstruction.solvers import Reconstruction
+from lfpiv_cli.synthetic.board import BoardPlacement, dot_centres
+from lfpiv_cli.weights.build import factorise_through, scene_distortion
+from lfpiv_cli.weights.columns import operator_of
+from lfpiv_cli.weights.model import Weights
 
 
 @styled
@@ -286,3 +295,49 @@ def place_figures(
 def depth_error(centre_mm: Sequence[float] | Floats, depths_mm: Sequence[float]) -> float:
     """Return Eq. 20 averaged over the steps between neighbouring depths."""
     return float(np.mean(np.abs(np.diff(centre_mm) / np.diff(depths_mm) - 1.0)))
+
+
+@dataclass(frozen=True, eq=False)
+class BoardBench:
+    """A camera before which boards are held.
+
+    Attributes
+    ----------
+    rig : its camera with the lattice of the weights' frame
+    weights : of the volume in which boards are reconstructed
+    picture : gives the picture (rows, columns) of a board in its place, in the weights' frame, dark taken off
+    excluded : pixels (rows, columns) of that frame that lie off the sensor
+    """
+
+    rig: Rig
+    weights: Weights
+    picture: Callable[[BoardPlacement], Image]
+    excluded: Mask
+
+    def with_voxels(self, grid: Grid, assumed: ObjectSpace) -> BoardBench:
+        """Return the bench with weights of equivalent points on another grid."""
+        camera = self.rig.camera
+        bend = None if self.weights.calibration is None else scene_distortion(camera, self.rig.media, grid)
+        operator = factorise_through(camera, assumed, grid)
+        weights = replace(self.weights, grid=grid, solver_operator=operator, scene_distortion_per_mm2=bend)
+        return replace(self, weights=weights)
+
+    def with_fitted_rays(self, pictures: Sequence[Image], depths_mm: Sequence[float]) -> BoardBench:
+        """Return the bench with weights of rays fitted to pictures of its board at depths."""
+        rays = fit_rays(pictures, depths_mm, self.rig.camera, self.rig.board, self.rig.media).rays
+        operator = operator_of(self.rig.camera, rays, self.weights.grid)
+        return replace(self, weights=replace(self.weights, solver_operator=operator, scene_distortion_per_mm2=None))
+
+
+BoardSolver = Callable[[Singles, Callable[[int], None]], Reconstruction]
+
+
+def board_in(
+    bench: BoardBench, solve: BoardSolver, picture: Singles, placement: BoardPlacement, advance: Callable[[int], None]
+) -> tuple[DotFigures, Singles, float]:
+    """Return what is measured of the board in a picture, its volume [z, y, x], and the solver's last residual."""
+    board, result = bench.rig.board, solve(picture, advance)
+    volume = bench.weights.to_world(result.volume)
+    centres = dot_centres(board, placement)[:, :2]
+    dots = measure_dots(volume, bench.weights.grid, centres, 0.5 * board.spacing_mm)
+    return dots, volume, float(result.residual[-1])

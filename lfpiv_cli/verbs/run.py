@@ -8,10 +8,9 @@ why, and what each step told; `report.html` shows all of it.
 What a run would make is known before anything is made. With weights at hand each batch tells of itself; before there
 are any, nothing else can be complete: frames and pairs are counted, and their files taken for as large as their arrays.
 
-With `--watch` each pair of a folder is taken through the steps by itself as a camera fills it, with a line for each and
-the picture of the last one. What its frames share with all others is known before: calibration and weights, by which
-methods the flow is measured (from the first pair), and the tracers' size, for which pairs are waited for until the
-first images show it. So the files are those of `run` once all pairs are there.
+With `--watch` a camera's folder is measured pair by pair, with a line for each and the picture of the last. What its
+frames share is known before: calibration, weights, methods (from the first pair), and the tracers' size, for which
+pairs wait until the first images show it. So the files are those of `run` once all pairs are there.
 """
 
 from __future__ import annotations

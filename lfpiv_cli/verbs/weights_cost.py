@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shutil
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -11,9 +12,9 @@ import numpy as np
 
 from lfpiv_cli.calibration.model import Calibration
 from lfpiv_cli.calibration.sheet import check_f_numbers, check_pitch, f_number_notices
-from lfpiv_cli.errors import ConfigError
+from lfpiv_cli.errors import ConfigError, OutputError
 from lfpiv_cli.files.config import Config
-from lfpiv_cli.files.inputs import ensure_disk, ensure_room
+from lfpiv_cli.files.inputs import GB, ensure_room
 from lfpiv_cli.files.weights_file import BYTES_A_VOXEL
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.notice import Notice, written
@@ -182,7 +183,9 @@ def ensure_fits(cost: Cost, output: Path) -> None:
     ensure_room(
         max(made, volume), f"a volume of {written(cost.voxels)} voxels (padding included), or its weights,", SMALLER
     )
-    ensure_disk(made, output)
+    left = shutil.disk_usage(output.parent).free
+    if made > left:
+        raise OutputError(f"{output}: needs {made / GB:.2f} GB, and {left / GB:.2f} GB are free on the disk")
 
 
 def ensure_volume_fits(settings: Config, by_volumes: bool) -> None:
