@@ -272,13 +272,13 @@ def _write_block(
     camera, room, x, y = view.camera, entries.room, projection.x, projection.y
     middle = view.centres_mm[block.j + block.rows // 2, block.i + block.columns // 2]
     bent = bent_at(view, projection, bend, middle[0], middle[1])
-    columns = _line_up(view, projection, bend, block, 0, room)
+    columns = _line_up(view, projection, (bend, bent), block, 0, room)
     if columns == 0:
         return 0
     _set_away(room, columns)
     if block.alone:
         _order_columns(room, columns, mean_width(view, projection))
-    rows = _line_up(view, projection, bend, block, 1, room)
+    rows = _line_up(view, projection, (bend, bent), block, 1, room)
     if rows == 0:
         return 0
     _fill(view, x, x.stretch * x.alpha + bent.gain_x, columns, room.table)
@@ -300,10 +300,13 @@ def _by_place(along: Along, gain: float) -> float:
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
-def _line_up(view: View, projection: Projection, bend: Bend, block: Block, axis: int, room: Scratch) -> int:
+def _line_up(
+    view: View, projection: Projection, rays: tuple[Bend, Bent], block: Block, axis: int, room: Scratch
+) -> int:
     """Put the lit pixels of a block's lenses side by side along an axis, 0 for x; return their number.
 
-    Sets the patches, offsets and drifts of a profile, and the lines' places.
+    `rays` are the particle's, and what they are moved by through the middle lens. Sets the patches, offsets and drifts
+    of a profile, and the lines' places.
     """
     camera, centres = view.camera, view.centres_mm
     along = projection.x if axis == 0 else projection.y
@@ -315,7 +318,9 @@ def _line_up(view: View, projection: Projection, bend: Bend, block: Block, axis:
     for n in range(block.columns if axis == 0 else block.rows):
         i, j = (block.i + n, middle_j) if axis == 0 else (middle_i, block.j + n)
         s = centres[j, i, axis]
-        bent = bent_at(view, projection, bend, centres[j, i, 0], centres[j, i, 1])
+        bent = rays[1]
+        if i != middle_i or j != middle_j:
+            bent = bent_at(view, projection, rays[0], centres[j, i, 0], centres[j, i, 1])
         moved, gain = (bent.x, bent.gain_x) if axis == 0 else (bent.y, bent.gain_y)
         offset, gain = along.at + moved - s, along.stretch * along.alpha + gain
         shift = (1.0 - camera.bend) * s - along.lever * along.beta * along.x
@@ -421,7 +426,11 @@ def _write_rows(
     away = np.hypot(x.lever * x.beta * x.ball / x.scale, y.lever * y.beta * y.ball / y.scale)
     inside = max(radius - 0.75 * width - away, 0.0) ** 2
     rim = np.float32(width), np.float32(radius), np.float32(inside)
-    of_plane, of_curved = _plane(view, projection, bend), _curved(view, projection, bend, bent)
+    curved = bend.cubic.shape[0] > 0
+    if curved:
+        of_curved = _curved(view, projection, bend, bent)
+    else:
+        of_plane = _plane(view, projection, bend)
     at, twice_lit = begin, False
     for n in range(columns):
         twice_lit = twice_lit or lines[TWIN[0], n] >= 0
@@ -433,7 +442,7 @@ def _write_rows(
             lines[LOW, m] = columns
             continue
         chosen = (low, high - low)
-        if bend.cubic.shape[0] > 0:
+        if curved:
             slopes = _slopes(view, projection, bend.cubic, bent, table[DOWN + PATCH + m])
             join_curved_row(table, chosen, m, rim, per_drift, of_curved, slopes)
         else:
