@@ -15,6 +15,8 @@ Integers: TypeAlias = NDArray[np.int64]
 Flags: TypeAlias = NDArray[np.bool_]
 # A number in either precision.
 Real: TypeAlias = float | np.floating[Any]
+# Rows and columns of a part of an image: all.
+EVERYWHERE = (slice(None), slice(None))
 
 
 def root_of_squares(values: NDArray[Any]) -> float:

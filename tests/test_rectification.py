@@ -101,6 +101,10 @@ def test_sampling_is_the_cubic_spline_and_compiled_kernels_equal_their_python(rn
     assert 0.8 < inside.mean() < 1.0
     np.testing.assert_allclose(rectification.apply(image)[inside], expected[inside], atol=1e-6)
     assert np.all(rectification.apply(image)[~inside] == 0.0)
+    window = slice(50, 71), slice(33, 90)
+    only = np.zeros(SHAPE)
+    only[window] = rectification.apply(image)[window]
+    np.testing.assert_allclose(rectification.apply(image, window), only, atol=1e-7)
     rectification = Rectification(known_fit(turned_lattice("hexagonal")), (14, 17))
     fit, upright = rectification.fit, rectification.lattice_px
     turn = turn_matrix(rectification.rotation_rad)

@@ -78,6 +78,35 @@ def test_forward_and_adjoint_are_adjoint(small, media, rng, column_axis, padding
     assert_adjoint(weights, rng)
 
 
+@pytest.mark.parametrize("column_axis", ["x", "y"])
+def test_a_part_is_what_the_whole_does_there(small, water, rng, column_axis):
+    whole = weights_of(
+        replace(small, column_axis=column_axis),
+        water,
+        Grid.centred((9, 7, 4), (0.1, 0.12, 0.4), (0.1, 0.2, 0.3)),
+        (1, 2, 0),
+    )
+    middle, reach = np.array([0.35, 0.05]), 0.21
+    part = whole.around(middle, reach)
+    centres = part.grid.centres_mm()
+    assert np.all(centres[..., :2].min(axis=(0, 1, 2)) <= middle - reach)
+    assert np.all(centres[..., :2].max(axis=(0, 1, 2)) >= middle + reach)
+    grid = whole.padded.grid
+    low = np.rint(grid.mm_to_voxel(centres[0, 0, 0])).astype(int)
+    within = tuple(slice(first, first + size) for first, size in zip(low[::-1], part.shape, strict=True))
+    np.testing.assert_allclose(centres, grid.centres_mm()[within], atol=1e-12)
+    assert np.prod(part.shape) < 0.5 * np.prod(whole.padded.shape)
+    volume, image = np.zeros(whole.padded.shape, np.float32), rng.random(whole.image_shape, dtype=np.float32)
+    volume[within] = rng.random(part.shape, dtype=np.float32)
+    projection = part.forward(volume[within])
+    np.testing.assert_allclose(projection, whole.padded.forward(volume), atol=1e-6)
+    np.testing.assert_allclose(part.adjoint(image), whole.padded.adjoint(image)[within], atol=1e-6)
+    outside = np.ones(whole.image_shape, bool)
+    outside[part.window] = False
+    assert outside.any()
+    assert not projection[outside].any()
+
+
 @pytest.mark.parametrize("shape", [(1, 1, 1), (5, 3, 4), (6, 9, 7)])
 def test_kernels_equal_dense_products(small, water, rng, shape):
     operator = factorise(small, water, Grid.centred(shape, (0.1, 0.1, 0.3), (0.0, 0.1, 1.0)))

@@ -7,6 +7,7 @@ that directions in the scene turn by the same angle, inverted image or not.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -15,7 +16,7 @@ from numba import njit
 from numpy.typing import ArrayLike
 from scipy import ndimage
 
-from lfpiv_cli.arrays import Flags, Floats, Integers, Singles
+from lfpiv_cli.arrays import EVERYWHERE, Flags, Floats, Integers, Singles
 from lfpiv_cli.calibration.lattice import EXPONENTS, LatticeFit
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.names import ColumnAxis
@@ -24,6 +25,8 @@ from lfpiv_cli.optics.line_responses import spline_weights
 from lfpiv_cli.threads import share_out
 
 EXPONENT_ARRAY = np.array(EXPONENTS, dtype=np.int64)
+# A pixel counts in the coefficients of a cubic spline so far away by less than rounding of single precision.
+SPLINE_REACH_PX = 16
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,8 +78,12 @@ class Rectification:
         row = np.arange(rows)[:, np.newaxis] + self.shift_px[..., 1]
         return (column >= 0.0) & (column <= columns - 1) & (row >= 0.0) & (row <= rows - 1)
 
-    def apply(self, image: ArrayLike) -> Singles:
-        """Return the rectified image, same shape, by cubic splines; 0 outside the sensor.
+    def apply(self, image: ArrayLike, window: tuple[slice, slice] = EVERYWHERE) -> Singles:
+        """Return the rectified image, same shape, by cubic splines; 0 outside the sensor and outside of a window.
+
+        Parameters
+        ----------
+        window : rows and columns
 
         Raises
         ------
@@ -85,9 +92,17 @@ class Rectification:
         raw = np.asarray(image, dtype=np.float64)
         if raw.shape != self.image_shape:
             raise InputError(f"the image is {raw.shape} and the white image {self.image_shape} (rows, columns)")
-        coefficients = ndimage.spline_filter(raw, order=3, mode="mirror")
-        rectified = np.zeros(self.image_shape, dtype=np.float32)
-        share_out(sample_rows, len(raw), coefficients, self.shift_px, self.inside, rectified)
+        inside = np.zeros_like(self.inside)
+        inside[window] = self.inside[window]
+        # Shifts and splines reach so far out of the window.
+        reach = SPLINE_REACH_PX + math.ceil(np.abs(self.shift_px[window]).max(initial=0.0))
+        ranges = [range(*each.indices(size)) for each, size in zip(window, self.image_shape, strict=True)]
+        part = tuple([slice(max(each.start - reach, 0), each.stop + reach) for each in ranges])
+        coefficients = ndimage.spline_filter(raw[part], order=3, mode="mirror")
+        shift, sampled = np.ascontiguousarray(self.shift_px[part]), np.zeros(coefficients.shape, np.float32)
+        share_out(sample_rows, len(sampled), coefficients, shift, np.ascontiguousarray(inside[part]), sampled)
+        rectified = np.zeros(self.image_shape, np.float32)
+        rectified[part] = sampled
         return rectified
 
     def nearest(self, image: ArrayLike) -> Singles:

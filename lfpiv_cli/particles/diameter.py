@@ -19,7 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numba import njit
@@ -59,6 +59,7 @@ from lfpiv_cli.particles.search import (
     with_typical_light,
 )
 from lfpiv_cli.particles.view import by_waves, footprint_radius_mm, on_array_mm, over_tiles, with_radius
+from lfpiv_cli.reconstruction.solvers import normalisers
 from lfpiv_cli.robust import MAD_TO_SIGMA, of_half_the_sum
 
 # Sizes that are tried first, in microlenses: each about twice the one before, from what no camera resolves on.
@@ -210,7 +211,7 @@ def measured_sizes(task: Task, diameter: float | None = None) -> Sizes:
         middle = np.median(candidates[:, :2], axis=0)
         distances = np.sort(np.linalg.norm(candidates[:, :2] - middle, axis=1))
         region = Region(middle, float(distances[min(MOST_CANDIDATES, len(distances)) - 1]))
-    candidates = candidates[region.holds(candidates)]
+        candidates, task = candidates[region.holds(candidates)], _about(task, region)
     # Typical is the light that most of the candidates' comes from.
     state = blank(task)
     *_, seen = judge(observed(task, state, LAST_UNEXPLAINED), candidates)
@@ -230,7 +231,7 @@ def measured_sizes(task: Task, diameter: float | None = None) -> Sizes:
         found = accepted(task, _begun(task, state), sought.candidates.copy(), SEARCH[0])
         diameter = _tried(task, found, _steps(diameter, share), SEARCH[0].unexplained).diameter
     sizes = _settled_sizes(sought, diameter, SEARCH)
-    return sizes if sizes.square.size else _settled_sizes(sought, _least_misfit(sought), ROUNDS)
+    return sizes if sizes.square.size else _settled_sizes(sought, *_least_misfit(sought))
 
 
 class Region(NamedTuple):
@@ -249,6 +250,21 @@ class Region(NamedTuple):
         return np.asarray(np.linalg.norm(points[:, :2] - self.middle_mm, axis=1) <= self.radius_mm)
 
 
+def _about(task: Task, region: Region) -> Task:
+    """Return the task with the volume of those voxels alone that light what the region does."""
+    view = task.view
+    ends = np.array([[*region.middle_mm, depth_mm] for depth_mm in task.depths_mm])
+    # Once to the pixels that the region lights, and once more to what else lights them.
+    spread = 2.0 * footprint_radius_mm(view, ends).max() * view.scale.lens_mm / (2.0 * view.half_x_mm)
+    middle, calibration = task.camera.to_image_axes(region.middle_mm), task.weights.calibration
+    if calibration is not None:
+        middle = calibration.rectification.from_world(middle, task.weights.column_axis)
+    weights = task.weights.around(middle, region.radius_mm + float(spread))
+    if weights is task.weights:
+        return task
+    return replace(task, weights=weights, sums=normalisers(weights.padded, task.sums.inverse_row_sum == 0.0))
+
+
 class Sought(NamedTuple):
     """What the search of a part of an image begins with.
 
@@ -264,7 +280,11 @@ class Sought(NamedTuple):
     region: Region
 
 
-def _found(sought: Sought, diameter: float, rounds: Sequence[Round]) -> tuple[Task, State]:
+# A task with a diameter, and what was found with it.
+Found: TypeAlias = tuple[Task, State]
+
+
+def _found(sought: Sought, diameter: float, rounds: Sequence[Round]) -> Found:
     """Return what rounds of the search find in the region with a diameter."""
     task = _of_diameter(sought.task, diameter)
     state = explained(task, _begun(task, sought.state), sought.candidates.copy(), rounds[0])
@@ -275,34 +295,39 @@ def _found(sought: Sought, diameter: float, rounds: Sequence[Round]) -> tuple[Ta
     return task, state
 
 
-def _least_misfit(sought: Sought) -> float:
+def _least_misfit(sought: Sought) -> tuple[float, Sequence[Round], Found]:
     """Return the diameter with which all rounds explain the image best, to half of `LADDER`: for crowded tracers.
 
-    With a wrong one neighbours are not found, and chi-squared is several times as large.
+    Along with these rounds and what they found with it. With a wrong diameter neighbours are not found, and chi-squared
+    is several times as large.
     """
 
-    def misfit(step: int) -> float:
+    def trial(step: int) -> tuple[float, Found]:
         task, state = _found(sought, UNKNOWN_LENSES * LADDER**step, ROUNDS)
         fits = judged(task, state, 0.0)
         bright = _bright(state, fits.seen)
-        return float(np.median(fits.chi2[bright])) if bright.any() else np.inf
+        return float(np.median(fits.chi2[bright])) if bright.any() else np.inf, (task, state)
 
-    best, least = 0, misfit(0)
+    best, (misfit, found) = 0, trial(0)
     for way in (-1, 1):
-        while abs(best) < MOST_STEPS and (trial := misfit(best + way)) < least:
-            best, least = best + way, trial
+        while abs(best) < MOST_STEPS and (other := trial(best + way))[0] < misfit:
+            best, (misfit, found) = best + way, other
         if best != 0:
             break
-    return UNKNOWN_LENSES * LADDER**best
+    return UNKNOWN_LENSES * LADDER**best, ROUNDS, found
 
 
-def _settled_sizes(sought: Sought, diameter: float, rounds: Sequence[Round]) -> Sizes:
-    """Return the sizes of tracers that stand alone, with the search made anew until the diameter stays."""
+def _settled_sizes(sought: Sought, diameter: float, rounds: Sequence[Round], first: Found | None = None) -> Sizes:
+    """Return the sizes of tracers that stand alone, with the search made anew until the diameter stays.
+
+    `first` is what was found with the diameter that it begins with, where that is known.
+    """
     for _ in range(SEARCHES):
         if diameter > LARGEST:
             return NO_SIZES
         searched_with = diameter
-        task, found = _found(sought, diameter, rounds)
+        task, found = first or _found(sought, diameter, rounds)
+        first = None
         for share in NARROW:
             diameters = _steps(diameter, share)
             diameter, losses, alone = _tried(task, found, diameters, LAST_UNEXPLAINED)

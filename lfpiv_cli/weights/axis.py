@@ -16,7 +16,7 @@ Axes: one image axis at a time (columns or rows), in mm about the optical axis; 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -113,6 +113,16 @@ class AxisWeights:
         """Return the cells of one voxel and their shares."""
         part = slice(*self.start[plane * self.voxels + voxel : plane * self.voxels + voxel + 2])
         return self.cell[part], self.share[part]
+
+    def part(self, voxels: slice) -> AxisWeights:
+        """Return the weights of some of the voxels, in all planes."""
+        row = np.arange(self.planes * self.voxels).reshape(self.planes, self.voxels)[:, voxels].ravel()
+        counts = self.start[row + 1] - self.start[row]
+        start = np.concatenate([[0], np.cumsum(counts)])
+        taken = np.arange(start[-1]) + np.repeat(self.start[row] - start[:-1], counts)
+        return replace(
+            self, voxels=row.size // self.planes, start=start, cell=self.cell[taken], share=self.share[taken]
+        )
 
     def matrix(self, plane: int) -> Singles:
         """Return the dense (cells, voxels) matrix of one plane."""

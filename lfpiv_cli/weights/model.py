@@ -14,14 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from lfpiv_cli.arrays import Floats, Singles
+from lfpiv_cli.arrays import EVERYWHERE, Floats, Singles
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.names import ColumnAxis
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media
 from lfpiv_cli.weights.build import default_padding, factorise
 from lfpiv_cli.weights.columns import OnDemandOperator
-from lfpiv_cli.weights.operators import Column, WeightsOperator, real_array, voxel_index
+from lfpiv_cli.weights.operators import Column, FactorisedOperator, WeightsOperator, real_array, voxel_index
 from lfpiv_cli.weights.strips import StripOperator
 
 if TYPE_CHECKING:
@@ -43,6 +43,7 @@ class Weights:
     calibration : undoes what keeps a raw image from fitting; None where nothing has to be undone
     scene_distortion_per_mm2 : (nz,) of the planes of `grid`: the operator takes a point at p for one at
         p (1 + k |p|^2), as the main lens's distortion is not in it; None where there is none
+    window : rows and columns of the pixels that `prepare` is asked for
     """
 
     grid: Grid
@@ -51,6 +52,7 @@ class Weights:
     column_axis: ColumnAxis
     calibration: Calibration | None = None
     scene_distortion_per_mm2: Floats | None = None
+    window: tuple[slice, slice] = EVERYWHERE
 
     @classmethod
     def factorised(cls, camera: Camera, media: Media, grid: Grid, calibration: Calibration | None = None) -> Weights:
@@ -87,11 +89,11 @@ class Weights:
         return "raw" if self.calibration is None else "rectified"
 
     def prepare(self, image: Singles) -> Singles:
-        """Take a raw image (rows, columns) to the frame of the weights."""
+        """Take a raw image (rows, columns) to the frame of the weights; of parts, what their voxels light."""
         image = real_array(image, self.image_shape, "an image")
         if self.calibration is None:
             return image.astype(np.float32)
-        return self.calibration.rectification.apply(image).astype(np.float32)
+        return self.calibration.rectification.apply(image, self.window)
 
     def forward(self, volume: Singles) -> Singles:
         """Return the image (rows, columns) that a volume [z, y, x] gives."""
@@ -119,6 +121,25 @@ class Weights:
             return self
         grid = self.grid.padded(self.padding_xyz)
         return Weights(grid, (0, 0, 0), self.solver_operator, self.column_axis, self.calibration)
+
+    def around(self, middle_mm: Floats, reach_mm: float) -> Weights:
+        """Return the weights of what of the padded grid lies about a point (x, y), through its whole depth.
+
+        All where they are no two factors.
+        """
+        operator, grid = self.solver_operator, self.padded.grid
+        if not isinstance(operator, FactorisedOperator):
+            return self
+        steps = (middle_mm - grid.origin_mm[:2]) / grid.spacing_mm[:2]
+        reach = reach_mm / np.array(grid.spacing_mm[:2])
+        last = np.array(grid.shape_xyz[:2]) - 1
+        low, high = np.clip([np.floor(steps - reach), np.ceil(steps + reach)], 0, last).astype(int).tolist()
+        x, y = (slice(first, end + 1) for first, end in zip(low, high, strict=True))
+        part = operator.part(y, x) if self.column_axis == "x" else operator.part(x, y)
+        shape = (x.stop - x.start, y.stop - y.start, grid.shape_xyz[2])
+        origin = tuple(grid.voxel_to_mm(np.array([*low, 0.0])).tolist())
+        within = Grid(shape, grid.spacing_mm, origin)
+        return replace(self, grid=within, padding_xyz=(0, 0, 0), solver_operator=part, window=part.window)
 
     @property
     def on_demand(self) -> bool:

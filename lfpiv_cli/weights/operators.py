@@ -340,6 +340,16 @@ class FactorisedOperator(SeparatedOperator):
         where = Blocks(first, np.minimum(planes - first, most), np.zeros_like(first))
         return where, BlockShape(most, filled(height, LANES))
 
+    @property
+    def window(self) -> tuple[slice, slice]:
+        """The rows and columns of the rectangle of pixels that any voxel lights."""
+        rows, columns = (each.cells.pixel[slice(*lit_range(each.cell))] for each in (self.rows, self.columns))
+        return slice(int(rows.min()), int(rows.max()) + 1), slice(int(columns.min()), int(columns.max()) + 1)
+
+    def part(self, row_voxels: slice, column_voxels: slice) -> FactorisedOperator:
+        """Return the weights of some voxels, through all planes."""
+        return replace(self, columns=self.columns.part(column_voxels), rows=self.rows.part(row_voxels))
+
     def forward(self, volume: Singles) -> Singles:
         ensure_own_threads()
         volume = real_array(volume, self.shape, "a volume")
