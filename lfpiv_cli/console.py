@@ -104,7 +104,14 @@ class Console:
             self.answer(line)
         if in_words and not self.verbose:
             return
-        blocks = _blocks(dict(_unfolded(figures)))
+        unfolded: dict[str, Any] = {}
+        for name, value in figures.items():
+            if isinstance(value, list) and value and all(isinstance(each, dict) for each in value):
+                records = [[readable(each) for each in record.values()] for record in value]
+                unfolded |= {first: "  ".join(rest) for first, *rest in records}
+            else:
+                unfolded[name] = value
+        blocks = _blocks(unfolded)
         first = max([NAME_WIDTH, *(len(name) for block in blocks for name in block)])
         for block in blocks:
             heads = list(dict.fromkeys(head for value in block.values() if _is_row(value) for head in value))
@@ -243,16 +250,6 @@ def _blocks(figures: Mapping[str, Any]) -> list[dict[str, Any]]:
         if len(heads) > len(block):
             blocks[k] = {head: {name: row.get(head) for name, row in block.items()} for head in heads}
     return blocks
-
-
-def _unfolded(figures: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
-    """Yield figures by name, the records of a list by their first entries."""
-    for name, value in figures.items():
-        if isinstance(value, list) and value and all(isinstance(each, dict) for each in value):
-            for first, *rest in (list(record.values()) for record in value):
-                yield readable(first), "  ".join(map(readable, rest))
-        else:
-            yield name, value
 
 
 def _is_row(value: Any) -> bool:

@@ -57,7 +57,7 @@ class Reply:
     seconds: float = 0.0
 
 
-class Outputs(Protocol):
+class AnyBatch(Protocol):
     """What a batch is to those who hand it out: it begins in each process, and makes one output at a time."""
 
     label: str
@@ -75,7 +75,7 @@ class Outputs(Protocol):
 
 
 def made_by_workers(
-    address: str, batch: Outputs, before: Mapping[int, Stamp], deadline: Deadline, work: Frames
+    address: str, batch: AnyBatch, before: Mapping[int, Stamp], deadline: Deadline, work: Frames
 ) -> Generator[tuple[int, Any], None, None]:
     """Yield outputs with what became of each, as the workers tell it.
 
@@ -128,7 +128,7 @@ def made_by_workers(
 class _Kept(WorkerPlugin):
     """What a worker process keeps of a command: its batch, made when the first output is asked for."""
 
-    def __init__(self, batch: Outputs, numbers: Sequence[int], threads: int) -> None:
+    def __init__(self, batch: AnyBatch, numbers: Sequence[int], threads: int) -> None:
         """Take the batch of the command, which travels as its arguments, and all numbers that will be asked for."""
         self.name = f"lfpiv-{uuid4().hex}"
         self._arguments, self._numbers, self._threads = pickle.dumps(batch), numbers, threads
@@ -137,7 +137,7 @@ class _Kept(WorkerPlugin):
     def setup(self, worker: Worker) -> None:
         """Begin in a worker process."""
         self._alone = threading.Lock()
-        self._batch: Outputs | None = None
+        self._batch: AnyBatch | None = None
 
     def make(self, number: int, before: Stamp) -> Reply:
         """Make an output as the command itself would, in its folder; one at a time in each process."""
@@ -156,7 +156,7 @@ class _Kept(WorkerPlugin):
                 # Paths mean what they mean to the command.
                 with contextlib.chdir(self._folder):
                     if self._batch is None:
-                        batch: Outputs = pickle.loads(self._arguments)
+                        batch: AnyBatch = pickle.loads(self._arguments)
                         batch.begin(self._numbers, console)
                         self._batch = batch
                     work = Frames(console, 1, 1.0, self._batch.label, self._batch.unit)

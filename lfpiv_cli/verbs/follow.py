@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
@@ -174,15 +174,9 @@ def follow_particles(
     ways = _ways(output, frames, settings, tracking, (weights, images), options, overwrite)
     last, there, results = ways[-1], ways[-1].order, [output / TRACKS, output / PLAYBACK]
     last.left_out, last.beside = left_out, [*results, *(path for way in ways[:-1] for path in way.outputs)]
-    chosen = BatchOptions(
-        resume=options.resume,
-        keep_going=options.keep_going,
-        dry_run=options.dry_run,
-        time_limit_s=options.time_limit_s,
-        begun_s=options.begun_s,
-    )
+    chosen = BatchOptions(**{each.name: getattr(options, each.name) for each in fields(WorkOptions)})
     if options.dry_run:
-        return carried_out(last, replace(chosen, failures=options.failures), console)
+        return carried_out(last, chosen, console)
     for path in results:
         atomic.ensure_writable(path, replacing, last.inputs)
     if last is not ways[0]:
