@@ -9,7 +9,7 @@ import tifffile
 from numpy.typing import ArrayLike
 
 from lfpiv_cli.arrays import Floats, Singles
-from lfpiv_cli.calibration.board import disc_shape, locate_board
+from lfpiv_cli.calibration.board import PictureFrame, disc_shape, locate_board
 from lfpiv_cli.calibration.board_pose import BoardGeometry, BoardPose, pose_of_dots
 from lfpiv_cli.calibration.corners import corner_shape
 from lfpiv_cli.calibration.dlfc import SeenBoard, aligned, entrance_pupil_mm, fit_rays, shown
@@ -104,7 +104,7 @@ def test_a_turned_sensor_is_turned_back(table2: Camera, rng: np.random.Generator
     dots = dot_places(BOARD, 0.5, (0.05, -0.03), (0.0, 0.0))
     seen = dots.copy()
     seen[:, :2] = dots[:, :2] @ np.array([[cosine, -sine], [sine, cosine]])
-    pose = locate_board(picture(camera, Media(), seen, 0.2, rng), camera, BOARD, Media(), rotation_rad=angle)
+    pose = locate_board(picture(camera, Media(), seen, 0.2, rng), camera, BOARD, Media(), PictureFrame(angle))
     agrees(pose, 0.5, (0.05, -0.03))
     assert pose.rotation_deg == pytest.approx(0.0, abs=0.3)
 

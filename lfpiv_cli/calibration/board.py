@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -187,15 +188,30 @@ def dots_look(image: Singles, passed: Singles, camera: Camera, board: BoardGeome
     return DotLook(signal, passed, media, radius, *first_dots(signal, camera, board, media))
 
 
+class PictureFrame(NamedTuple):
+    """How a rectified picture was taken from the raw one.
+
+    Attributes
+    ----------
+    rotation_rad : angle that was taken out
+    off_px : (rows, columns, 2) where pixels lie beside their places, column first; None: there
+    """
+
+    rotation_rad: float = 0.0
+    off_px: Singles | None = None
+
+
+UPRIGHT = PictureFrame()
+
+
 def locate_board(
     image: Singles,
     camera: Camera,
     board: BoardGeometry,
     media: Media,
-    rotation_rad: float = 0.0,
+    frame: PictureFrame = UPRIGHT,
     transmission: Singles | None = None,
     light: WaveLight | None = None,
-    off_px: Singles | None = None,
 ) -> BoardPose:
     """Find the dots of a board in depth by fitting each one's rendering, and the board through them.
 
@@ -203,11 +219,9 @@ def locate_board(
     ----------
     image : (rows, columns) rectified picture less the dark frame
     camera : with the lattice of the rectified frame
-    rotation_rad : angle that rectification took out
+    frame : of image and transmission
     transmission : (rows, columns) share of light that pixels pass, rectified; default: all the same
     light : waves, behind square microlenses; default: rays
-    off_px : (rows, columns, 2) where the pixels of image and transmission lie beside their places, column first;
-        default: there
 
     Raises
     ------
@@ -223,13 +237,13 @@ def locate_board(
 
     def seen(look: Look, by: WaveLight | None = None) -> tuple[BoardPose, Floats]:
         """Return the pose as the camera sees it, and where an ideal one has the points on the array (n, 2)."""
-        places, sigmas, numbers = look.measured(camera, board, rotation_rad, by)
+        places, sigmas, numbers = look.measured(camera, board, frame.rotation_rad, by)
         forward = camera.image_distance_mm / equivalent_object_distance(places[:, 2], camera.focus_distance_mm, medium)
         array = -forward[:, np.newaxis] * camera.to_image_axes(places)[:, :2]
         return pose_of_dots(places, sigmas, array, camera, board, numbers, medium), array
 
     try:
-        look = replace(LOOKS[board.pattern](image, passed, camera, board, medium), off_px=off_px)
+        look = replace(LOOKS[board.pattern](image, passed, camera, board, medium), off_px=frame.off_px)
         # Again with the magnification and the distortion that the first pose tells. Rays are near enough for these;
         # waves then take one look more.
         for _ in range(LENS_ROUNDS):

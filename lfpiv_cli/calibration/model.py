@@ -15,7 +15,7 @@ from threadpoolctl import threadpool_limits
 
 from lfpiv_cli.arrays import Floats, Singles
 from lfpiv_cli.calibration import white as of_white
-from lfpiv_cli.calibration.board import locate_board
+from lfpiv_cli.calibration.board import PictureFrame, locate_board
 from lfpiv_cli.calibration.board_pose import BoardGeometry, BoardPose
 from lfpiv_cli.calibration.dlfc import RayFit, fit_rays
 from lfpiv_cli.calibration.lattice import LatticeFit, fit_lattice
@@ -273,8 +273,8 @@ def calibrate(pictures: Photographs, rig: Rig | None = None, sheet: DataSheet = 
         board, camera = upright.nearest(pictures.less_dark(pictures.board)), calibration.camera(rig.camera)
         if calibration.white is not None:
             passed = of_white.relative_transmission(upright.nearest(calibration.white), upright.lattice_px)
-        turn = upright.rotation_rad
-        pose = locate_board(board, camera, rig.board, rig.media, turn, passed, rig.light, upright.off_px)
+        frame = PictureFrame(upright.rotation_rad, upright.off_px)
+        pose = locate_board(board, camera, rig.board, rig.media, frame, passed, rig.light)
     return with_mid_plane(replace(calibration, pose=pose), pose, rig)
 
 
