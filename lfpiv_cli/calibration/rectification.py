@@ -94,10 +94,8 @@ class Rectification:
             raise InputError(f"the image is {raw.shape} and the white image {self.image_shape} (rows, columns)")
         inside = np.zeros_like(self.inside)
         inside[window] = self.inside[window]
-        # Shifts and splines reach so far out of the window.
-        reach = SPLINE_REACH_PX + math.ceil(np.abs(self.shift_px[window]).max(initial=0.0))
         ranges = [range(*each.indices(size)) for each, size in zip(window, self.image_shape, strict=True)]
-        part = tuple([slice(max(each.start - reach, 0), each.stop + reach) for each in ranges])
+        part = tuple([slice(max(each.start - self._reach_px, 0), each.stop + self._reach_px) for each in ranges])
         coefficients = ndimage.spline_filter(raw[part], order=3, mode="mirror")
         shift, sampled = np.ascontiguousarray(self.shift_px[part]), np.zeros(coefficients.shape, np.float32)
         share_out(sample_rows, len(sampled), coefficients, shift, np.ascontiguousarray(inside[part]), sampled)
@@ -107,8 +105,8 @@ class Rectification:
 
     def nearest(self, image: ArrayLike) -> Singles:
         """Return the rectified image (rows, columns): for each pixel the nearest raw one, 0 outside the sensor."""
-        column, row = self._nearest_px.T.astype(np.int64)
-        return np.where(self.inside, np.asarray(image, dtype=np.float32)[row.T, column.T], np.float32(0.0))
+        column, row = np.moveaxis(self._nearest_px.astype(np.int64), -1, 0)
+        return np.where(self.inside, np.asarray(image, dtype=np.float32)[row, column], np.float32(0.0))
 
     @property
     def off_px(self) -> Singles:
@@ -117,7 +115,12 @@ class Rectification:
         off = self._nearest_px - np.stack([columns, rows], axis=-1) - self.shift_px
         return np.asarray(off @ turn_matrix(self.rotation_rad), dtype=np.float32)
 
-    @property
+    @cached_property
+    def _reach_px(self) -> int:
+        """How far out of a window its shifts and splines reach."""
+        return SPLINE_REACH_PX + math.ceil(np.abs(self.shift_px).max(initial=0.0))
+
+    @cached_property
     def _nearest_px(self) -> Singles:
         """The raw pixel (rows, columns, 2) nearest to each rectified one, column first, on the sensor."""
         rows, columns = np.indices(self.image_shape, dtype=np.float32)
