@@ -201,7 +201,7 @@ class PictureFrame(NamedTuple):
     off_px: Singles | None = None
 
 
-UPRIGHT = PictureFrame()
+UNTURNED = PictureFrame()
 
 
 def locate_board(
@@ -209,7 +209,7 @@ def locate_board(
     camera: Camera,
     board: BoardGeometry,
     media: Media,
-    frame: PictureFrame = UPRIGHT,
+    frame: PictureFrame = UNTURNED,
     transmission: Singles | None = None,
     light: WaveLight | None = None,
 ) -> BoardPose:

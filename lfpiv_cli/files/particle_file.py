@@ -40,7 +40,7 @@ from lfpiv_cli.results import ArrayResult
 MM_PER_M = 1000.0
 
 # What a list need not tell, in the order of the attributes of `Particles`.
-UNTOLD = ("brightness", "diameter_mm", "frame_position_mm", "frame_brightness")
+SOMETIMES_THERE = ("brightness", "diameter_mm", "frame_position_mm", "frame_brightness")
 # Places, which deflate can hardly shrink, tell how large the others may be, which can all be alike.
 PLACES, LARGEST_PLACES_RATIO = "position_mm", 300
 # Arrays are of 8 bytes a number at most, float64 in memory.
@@ -85,7 +85,7 @@ def read_particles(path: Path) -> Particles:
             for entry in stored.infolist():
                 stored.open(entry).close()
             there = set(stored.namelist())
-            names = ["position_mm", "velocity_mm_s", *(name for name in UNTOLD if f"{name}.npy" in there)]
+            names = ["position_mm", "velocity_mm_s", *(name for name in SOMETIMES_THERE if f"{name}.npy" in there)]
             # Places first, by which the size of the others is judged.
             for name in sorted(names, key=lambda name: not name.endswith(PLACES)):
                 arrays[name] = _read_array(stored, name, max((array.size for array in arrays.values()), default=0))
@@ -104,7 +104,7 @@ def read_particles(path: Path) -> Particles:
     if not all((np.abs(values) < LARGEST_VALUE).all() for values in (position, velocity, *arrays.values())):
         what = f"is not a finite number below {written(LARGEST_VALUE)}"
         raise InputError(f"{path}: a position, velocity, brightness or diameter {what}")
-    return Particles(position, velocity / MM_PER_M, arrays["brightness"], *map(arrays.get, UNTOLD[1:]))
+    return Particles(position, velocity / MM_PER_M, arrays["brightness"], *map(arrays.get, SOMETIMES_THERE[1:]))
 
 
 def _read_array(stored: zipfile.ZipFile, name: str, largest: int) -> NDArray[np.float64]:
