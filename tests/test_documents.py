@@ -17,7 +17,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import click
-import h5py
 import imagecodecs
 import numpy as np
 import pytest
@@ -268,15 +267,20 @@ def chain_of(page: Path) -> list[str]:
     return [each for each in commands_of(page) if each.startswith("lfpiv ") and "validate paper" not in each]
 
 
-@pytest.fixture(scope="module")
-def furnished(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder in which a page begins: the sample, and what the README's chain makes of it."""
-    folder = tmp_path_factory.mktemp("furnished")
+def run_on_the_sample(commands: list[str], folder: Path) -> Path:
+    """Run commands in a folder of the sample and of configs; return the folder."""
     write_images(folder)
     write_configs(folder)
     with contextlib.chdir(folder):
-        for command in chain_of(ROOT / "README.md"):
+        for command in commands:
             run(command)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def furnished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder in which a page begins: the sample, and what the README's chain makes of it."""
+    folder = run_on_the_sample(chain_of(ROOT / "README.md"), tmp_path_factory.mktemp("furnished"))
     write_third_frame(folder)
     return folder
 
@@ -284,15 +288,9 @@ def furnished(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def measured(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder in which scripts of the gallery run: the sample, and its volumes, vectors, particles and tracks."""
-    folder = tmp_path_factory.mktemp("measured")
-    write_images(folder)
-    write_configs(folder)
     chain = [command for command in chain_of(ROOT / "README.md") if command.split()[1] not in ("run", "validate")]
     last = next(number for number, command in enumerate(chain) if command.split()[1] == "track")
-    with contextlib.chdir(folder):
-        for command in chain[: last + 1]:
-            run(command)
-    return folder
+    return run_on_the_sample(chain[: last + 1], tmp_path_factory.mktemp("measured"))
 
 
 GALLERY = sorted((ROOT / "examples" / "gallery").glob("*.py"))
@@ -357,17 +355,6 @@ def test_the_python_page_uses_what_is_promised() -> None:
     assert set(re.findall(r"\blf\.(\w+)", page)) <= set(lfpiv_cli.__all__)
 
 
-# The section of docs/files.md that specifies each file of the sample's chain.
-SPECIFIED = {
-    "calibration.h5": (1, 2),
-    "weights.h5": (1, 2, 3),
-    "volumes/a.vtkhdf": (1, 4),
-    "vectors.vtkhdf": (1, 4, 5),
-    "combined.vtkhdf": (1, 4, 5),
-    "tracks_grid.vtkhdf": (1, 4, 5),
-    "particles/a.vtkhdf": (1, 6),
-    "tracks.vtkhdf": (1, 6, 7),
-}
 # The formats with the version that is written, and those that are read.
 VERSIONS = {
     calibration_file.FORMAT: (calibration_file.VERSION,),
@@ -387,53 +374,3 @@ def test_versions_of_formats_are_those_that_are_written_and_read() -> None:
     assert named.keys() == VERSIONS.keys()
     for name, versions in VERSIONS.items():
         assert (named[name][0], set(named[name])) == (versions[0], set(versions)), name
-
-
-# What HDF5 itself keeps beside dimension scales, and the datasets of VTK's cells, are named once for all.
-GENERIC = {"CLASS", "NAME", "REFERENCE_LIST", "DIMENSION_LIST", "units", "Attribute"}
-
-
-def members_of(path: Path) -> Iterator[str]:
-    """Yield each dataset as `group/name` and each attribute as `group@name`."""
-    with h5py.File(path) as file:
-        objects: list[tuple[str, h5py.Group | h5py.Dataset]] = [("", file)]
-        file.visititems(lambda name, item: objects.append((name, item)))
-        for name, item in objects:
-            yield from (f"{name}@{attribute}" for attribute in item.attrs)
-            if isinstance(item, h5py.Dataset):
-                yield name
-
-
-def is_named(member: str, text: str) -> bool:
-    """Return whether a page names a member, by its whole path or as one of several that are alike."""
-    member = member.removeprefix("calibration/").removeprefix("VTKHDF/PointData/")
-    place, _, attribute = member.rpartition("@")
-    if attribute in GENERIC and place:
-        return f"`{attribute}`" in text
-    if member.startswith("VTKHDF/") and "/" in member.removeprefix("VTKHDF/"):
-        group, _, name = member.rpartition("/")
-        return f"`{group}`" in text and f"`{name}`" in text
-    return f"`{member.removeprefix('calibration')}`" in text or f"`{member}`" in text
-
-
-def unnamed(path: Path, sections: tuple[int, ...]) -> list[str]:
-    """Return the members of a file that its specification does not name."""
-    page = (ROOT / "docs" / "files.md").read_text(encoding="utf-8")
-    parts = {int(part.split(".", 1)[0]): part for part in page.split("\n## ") if part[0].isdigit()}
-    text = "\n".join(parts[number] for number in sections)
-    return [member for member in members_of(path) if not is_named(member, text)]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", SPECIFIED)
-def test_files_hold_nothing_that_is_not_specified(furnished, name) -> None:
-    assert unnamed(furnished / name, SPECIFIED[name]) == []
-
-
-def test_a_member_that_is_not_specified_is_found(tmp_path) -> None:
-    with h5py.File(tmp_path / "c.h5", "w") as file:
-        file.attrs["format"] = np.bytes_("lfpiv-calibration")
-        file["lattice/origin_px"] = np.zeros(2)
-        file["lattice/secret_px"] = np.zeros(2)
-        file["lattice"].attrs["secret"] = 1
-    assert set(unnamed(tmp_path / "c.h5", SPECIFIED["calibration.h5"])) == {"lattice/secret_px", "lattice@secret"}

@@ -280,6 +280,46 @@ def test_each_dataset_has_its_unit_and_is_described(files: WrittenFiles, name: s
         assert not [word for word in words if not re.search(rf"`(\w+/)*{word}`", described)], kind
 
 
+# The sections of docs/files.md that specify a file, beside the first, which is of all.
+SPECIFIED = {
+    "calibration": (2,),
+    "weights": (2, 3),
+    "volume": (4,),
+    **dict.fromkeys(("vectors", "combined vectors", "tracks on a grid"), (4, 5)),
+    "particles": (6,),
+    "tracks": (6, 7),
+}
+# What HDF5 itself keeps beside dimension scales, and the datasets of VTK's cells, are named once for all.
+GENERIC = {"CLASS", "NAME", "REFERENCE_LIST", "DIMENSION_LIST", "units", "Attribute"}
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("kind", SPECIFIED)
+def test_a_file_holds_nothing_that_is_not_specified(files: WrittenFiles, kind: str) -> None:
+    page = (ROOT / "docs" / "files.md").read_text(encoding="utf-8")
+    parts = {int(part.split(".", 1)[0]): part for part in page.split("\n## ") if part[0].isdigit()}
+    text = "\n".join(parts[number] for number in (1, *SPECIFIED[kind]))
+    with h5py.File(files.path(kind)) as file:
+        objects: list[tuple[str, h5py.Group | h5py.Dataset]] = [("", file)]
+        file.visititems(lambda name, item: objects.append((name, item)))
+        members = [name for name, item in objects if isinstance(item, h5py.Dataset)]
+        members += [f"{name}@{attribute}" for name, item in objects for attribute in item.attrs]
+    assert members
+    assert not [member for member in members if not is_named(member, text)]
+
+
+def is_named(member: str, text: str) -> bool:
+    """Return whether a page names a member, by its whole path or as one of several that are alike."""
+    member = member.removeprefix("calibration/").removeprefix("VTKHDF/PointData/")
+    place, _, attribute = member.rpartition("@")
+    if attribute in GENERIC and place:
+        return f"`{attribute}`" in text
+    if member.startswith("VTKHDF/") and "/" in member.removeprefix("VTKHDF/"):
+        group, _, name = member.rpartition("/")
+        return f"`{group}`" in text and f"`{name}`" in text
+    return f"`{member.removeprefix('calibration')}`" in text or f"`{member}`" in text
+
+
 def datasets_of(file: h5py.File) -> Iterator[tuple[str, str]]:
     """Yield the path and the unit of each dataset but VTK's own tables, which say how its points and cells lie."""
     paths: list[str] = []
