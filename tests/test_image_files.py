@@ -2,13 +2,13 @@
 
 import contextlib
 import hashlib
+import io
 import json
 import os
 import struct
 import subprocess
 import sys
 import time
-import tracemalloc
 import zlib
 from pathlib import Path
 
@@ -19,7 +19,6 @@ import pytest
 import tifffile
 
 import lfpiv_cli as lf
-from lfpiv_cli.cli.options import print_json
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.files import recording_formats as formats
 from lfpiv_cli.files.images import count_pages, read_image, read_single, write_tiff
@@ -39,22 +38,24 @@ def picture(path: Path, value: float) -> Path:
     return path
 
 
+CALIBRATE = ("calibrate-snapshot", CONFIG, "--white", SAMPLE / "white.tif")
+
+
 @pytest.mark.thorough
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e300, 1e30])
-@pytest.mark.parametrize("option", ["--dark", "--background", "--mask"])
-def test_a_reference_without_counts_is_refused(tmp_path: Path, weights: Path, option: str, value: float) -> None:
-    image = picture(tmp_path / "reference.tif", value)
-    code, said = ended("reconstruct", weights, SAMPLE / "pair_a.tif", option, image, "-o", tmp_path / "v.vtkhdf")
+@pytest.mark.parametrize(
+    ("command", "option"),
+    [("reconstruct", option) for option in ("--dark", "--background", "--mask")]
+    + [("calibrate", option) for option in ("--white", "--dark", "--board")],
+)
+def test_a_reference_without_counts_is_refused(
+    tmp_path: Path, weights: Path, command: str, option: str, value: float
+) -> None:
+    image, target = picture(tmp_path / "reference.tif", value), tmp_path / "out.h5"
+    words = CALIBRATE if command == "calibrate" else ("reconstruct", weights, SAMPLE / "pair_a.tif")
+    code, said = ended(*words, option, image, "-o", target)
     assert (code, "reference.tif: 1 of its 268800 pixels are not counts" in said) == (4, True), said
-    assert not (tmp_path / "v.vtkhdf").exists()
-
-
-@pytest.mark.parametrize("option", ["--white", "--dark", "--board"])
-def test_so_it_is_in_a_calibration(tmp_path: Path, option: str) -> None:
-    given = {"--white": SAMPLE / "white.tif", option: picture(tmp_path / "reference.tif", np.nan)}
-    words = [word for pair in given.items() for word in pair]
-    code, said = ended("calibrate-snapshot", ROOT / "configs" / "sample.yaml", *words, "-o", tmp_path / "c.h5")
-    assert (code, "reference.tif: 1 of its" in said) == (4, True), said
+    assert not target.exists()
 
 
 @pytest.mark.thorough
@@ -64,11 +65,6 @@ def test_frames_with_such_pixels_give_volumes_of_numbers(tmp_path: Path, weights
     code, said = ended("reconstruct", weights, frame, "-o", tmp_path / "v.vtkhdf")
     assert (code, said) == (0, "")
     assert ended("info", tmp_path / "v.vtkhdf") == (0, "")
-
-
-def test_figures_that_are_no_numbers_are_null(capsys: pytest.CaptureFixture[str]) -> None:
-    print_json({"error": np.float64(np.nan), "by_plane": [1.0, np.inf]})
-    assert json.loads(capsys.readouterr().out) == {"error": None, "by_plane": [1.0, None]}
 
 
 @pytest.mark.thorough
@@ -120,14 +116,11 @@ def test_every_kind_of_tiff_gives_the_same_frames_and_none_is_lost(tmp_path: Pat
 @pytest.mark.parametrize("kind", ["u1", "u2", "u4", "i2", "f4", "f8"])
 def test_kinds_of_pixels(tmp_path: Path, kind: str) -> None:
     image = FRAMES[0].astype(kind)
+    if kind == "f8":  # what is no number, or more than 32 bits hold, is passed on
+        image[0, :3] = np.nan, np.inf, 1e300
     tifffile.imwrite(tmp_path / "t.tif", image, photometric="minisblack")
-    np.testing.assert_array_equal(read_single(tmp_path / "t.tif"), image.astype(np.float32))
-
-
-def test_not_a_number_is_passed_on(tmp_path: Path) -> None:
-    image = np.array([[1.0, np.nan], [np.inf, 1e300]])
-    tifffile.imwrite(tmp_path / "t.tif", image, photometric="minisblack")
-    np.testing.assert_array_equal(read_single(tmp_path / "t.tif"), [[1.0, np.nan], [np.inf, np.inf]])
+    with np.errstate(over="ignore"):
+        np.testing.assert_array_equal(read_single(tmp_path / "t.tif"), image.astype(np.float32))
 
 
 @pytest.mark.parametrize("bits", [8, 16])
@@ -224,11 +217,6 @@ def png(columns: int, rows: int, data: bytes, bits: int = 16) -> bytes:
 NOTHING = zlib.compress(bytes(20_000))
 
 
-def test_an_honest_tiff_of_that_kind_is_read(tmp_path: Path) -> None:
-    (tmp_path / "t.tif").write_bytes(tiff_file(100, 100, NOTHING, 8))
-    np.testing.assert_array_equal(read_single(tmp_path / "t.tif"), np.zeros((100, 100)))
-
-
 # What is no image that could be, and words of what is said of it.
 ABSURD_IMAGES = [
     (tiff_file(400_000, 400_000, NOTHING, 8), "declares 400000 x 400000"),
@@ -279,11 +267,6 @@ def test_written_images_read_back_and_hold_no_time(tmp_path: Path) -> None:
         assert not {"DateTime", "Software"} & {tag.name for tag in file.pages[0].tags}
 
 
-def test_the_experiments_images(data_folder: Path) -> None:
-    image = read_single(data_folder / "channel" / "dark.tif", (1768, 2352))
-    assert image.mean() == pytest.approx(96.0, abs=0.1)  # the dark level, read noise 6 over four million pixels
-
-
 def directories(count: int, tags: tuple[int, ...] = (256, 257, 273)) -> bytes:
     """Return a TIFF of many directories of few tags."""
     size = 2 + 12 * len(tags) + 4
@@ -295,38 +278,51 @@ def directories(count: int, tags: tuple[int, ...] = (256, 257, 273)) -> bytes:
     return b"".join(parts)
 
 
-def test_directories_without_an_image_or_an_end_are_given_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def written(**options: object) -> bytes:
+    """Return a TIFF as others write it."""
+    tifffile.imwrite(file := io.BytesIO(), np.full((ROWS, COLUMNS), 100, np.uint8), photometric="minisblack", **options)
+    return file.getvalue()
+
+
+def retagged(content: bytes, tag: int, value: int) -> bytes:
+    """Return a TIFF with another value of a tag, of a list its first."""
+    with tifffile.TiffFile(file := io.BytesIO(content), mode="r+b") as tiff:
+        found = tiff.pages[0].tags[tag]
+        found.overwrite([value, *found.value[1:]] if isinstance(found.value, tuple) else value)
+        return file.getvalue()
+
+
+OF_STRIPS, OF_TILES = 279, 325
+WITHOUT_AN_END = [
+    (directories(100, (256,)), "the directory of page 0 is of no image"),
+    (directories(51), "it holds more than 50 pages"),
+    (retagged(written(), 259, 4), "for black and white alone"),
+    (png(600, 448, zlib.compress(bytes(20_000_000)), 8), "more than the 600 x 448 pixels"),
+    (retagged(written(), OF_STRIPS, 999), "strip or tile 0 of page 0 has"),
+    (retagged(written(rowsperstrip=64), OF_STRIPS, 999), "strip or tile 0 of page 0 has"),
+    (retagged(written(tile=(64, 64)), OF_TILES, 999), "strip or tile 0 of page 0 has"),
+]
+
+
+@pytest.mark.parametrize(("content", "words"), WITHOUT_AN_END, ids=lambda each: each if isinstance(each, str) else "")
+def test_images_of_the_sensor_s_size_that_go_on_or_end_too_early_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, content: bytes, words: str
+) -> None:
+    """Pages without end, a fax, more than was declared, and bytes after what is too short, which are no pixels."""
     monkeypatch.setattr(formats, "MOST_PAGES", 50)
-    path = tmp_path / "many.tif"
-    for content, words in (
-        (directories(100, (256,)), "many.tif: the directory of page 0 is of no image"),
-        (directories(51), "many.tif: it holds more than 50 pages"),
-    ):
+    (tmp_path / "t.img").write_bytes(content)
+    code, said = ended("check", CONFIG, tmp_path / "t.img")
+    assert (code, f"t.img: {words}" in said or words in said) == (4, True), said
+
+
+def test_honest_images_of_those_kinds_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(formats, "MOST_PAGES", 50)
+    path = tmp_path / "t.img"
+    for content in (tiff_file(100, 100, NOTHING, 8), png(7, 5, zlib.compress(bytes(5 * 8)), 8)):
         path.write_bytes(content)
-        code, said = ended("check", CONFIG, path)
-        assert (code, words in said) == (4, True), said
+        assert not read_single(path).any()
     path.write_bytes(directories(50))
     assert count_pages(path) == 50
-
-
-def test_counts_that_say_they_are_a_fax_are_refused(tmp_path: Path) -> None:
-    path = tmp_path / "fax.tif"
-    tifffile.imwrite(path, np.ones((448, 600), np.uint8))
-    content = path.read_bytes()
-    plain = struct.pack("<HHIHH", 259, 3, 1, 1, 0)
-    assert content.count(plain) == 1
-    path.write_bytes(content.replace(plain, struct.pack("<HHIHH", 259, 3, 1, 4, 0)))
-    code, said = ended("check", CONFIG, path)
-    assert (code, "for black and white alone" in said) == (4, True), said
-
-
-def test_a_png_that_unpacks_to_more_than_it_declares_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "bomb.grey_png"
-    path.write_bytes(png(600, 448, zlib.compress(bytes(20_000_000)), 8))
-    code, said = ended("check", CONFIG, path)
-    assert (code, "more than the 600 x 448 pixels" in said) == (4, True), said
-    path.write_bytes(png(7, 5, zlib.compress(bytes(5 * 8)), 8))
-    assert not read_single(path).any()
 
 
 def sums(folder: Path, *names: str) -> Path:
@@ -390,17 +386,6 @@ def test_what_a_decoder_complains_of_is_a_warning(tmp_path: Path, capsys: pytest
     assert capsys.readouterr().err == ""
 
 
-@pytest.mark.parametrize("layout", [{}, {"rowsperstrip": 64}, {"tile": (64, 64)}], ids=str)
-def test_bytes_after_what_is_too_short_are_no_pixels(tmp_path: Path, layout: dict) -> None:
-    path = tmp_path / "short.tif"
-    tifffile.imwrite(path, np.full((ROWS, COLUMNS), 100, np.uint16), photometric="minisblack", **layout)
-    with tifffile.TiffFile(path, mode="r+") as file:
-        lengths = file.pages[0].tags["TileByteCounts" if "tile" in layout else "StripByteCounts"]
-        lengths.overwrite([lengths.value[0] // 2, *lengths.value[1:]])
-    code, said = ended("check", CONFIG, path)
-    assert (code, "short.tif: strip or tile 0 of page 0 has" in said) == (4, True), said
-
-
 @pytest.mark.parametrize("kind", ["a strip that is too long", "a PNG that is too long", "no image"])
 def test_gigabytes_of_no_image_are_refused_unread(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str) -> None:
     path = tmp_path / ("big.png" if "PNG" in kind else "big.tif")
@@ -424,10 +409,7 @@ def test_absurd_images_are_refused_quickly(tmp_path: Path, content: bytes, words
     """As images of any size, and by a command that knows its sensor."""
     path, begun = tmp_path / "t.img", time.thread_time()
     path.write_bytes(content)
-    tracemalloc.start()
     assert refused(lambda: read_single(path), words)
-    assert tracemalloc.get_traced_memory()[1] < 100_000_000
-    tracemalloc.stop()
     code, said = ended("calibrate-snapshot", CONFIG, "--white", path, "-o", tmp_path / "c.h5")
     assert (code, "t.img" in said, (tmp_path / "c.h5").exists()) == (4, True, False), said
     assert time.thread_time() - begun < 1.0
