@@ -156,23 +156,17 @@ def test_info_still_tells_of_results_and_of_nothing_else(folder: Path) -> None:
     assert drawn == (2, "--picture draws a voxel of weights")
 
 
-# Copies of which so much is kept: what is said, and the exit code.
-CUT = "cut off or damaged"
-FAULTS = {
-    "cine.cine": (0.9, CUT, 4),
-    "packed.cine": (0.9, CUT, 4),
-    "seq.seq": (0.9, CUT, 4),
-    "mraw.mraw": (1.0, "mraw.cihx or .cih is not beside it", 4),
-    "hdf5.h5": (0.9, "hdf5.h5", 4),
-    "davis.im7": (0.9, CUT, 4),
-    "set.set": (1.0, "the folder of its images, set, is not beside it", 4),
-    "raw.raw": (1.0, "state its layout with --raw", 2),
-}
-
-
-@pytest.mark.parametrize("name", FAULTS)
-def test_commands_refuse_a_cut_recording_by_its_name(folder: Path, tmp_path: Path, name: str) -> None:
-    kept, words, code = FAULTS[name]
+@pytest.mark.parametrize(
+    ("name", "kept", "words", "code"),
+    [
+        ("cine.cine", 0.9, "cut off or damaged", 4),
+        ("set.set", 1.0, "the folder of its images, set, is not beside it", 4),
+        ("raw.raw", 1.0, "state its layout with --raw", 2),
+    ],
+)
+def test_commands_refuse_a_recording_by_its_name(
+    folder: Path, tmp_path: Path, name: str, kept: float, words: str, code: int
+) -> None:
     whole = (folder / name).read_bytes()
     (tmp_path / name).write_bytes(whole[: int(len(whole) * kept)])
     found, said = ended("reconstruct", folder / "weights.h5", tmp_path / name, "-o", tmp_path / "v.vtkhdf")

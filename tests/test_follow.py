@@ -4,7 +4,6 @@ import json
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -119,34 +118,6 @@ def test_the_same_in_memory(rig: Path, followed: Path, one_thread: Callable[[], 
         for name, array in written.arrays.items():
             np.testing.assert_array_equal(points.arrays[name], array)
     np.testing.assert_array_equal(found.tracks.points.position_mm, tracks_of(followed).position_mm)
-
-
-@pytest.mark.thorough
-def test_what_was_stopped_goes_on(rig: Path, followed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """As if it had not been, on other threads; so does what has lost a file."""
-    make = stage.Way.make
-
-    def broken(self: Any, number: int, work: Any) -> None:
-        if number == 2:
-            raise RuntimeError("power cut")
-        make(self, number, work)
-
-    monkeypatch.setattr(stage.Way, "make", broken)
-    options = stage.FollowOptions(dark=rig / "dark.tif")
-    with pytest.raises(RuntimeError, match="power cut"):
-        stage.follow_particles(rig / "weights.h5", images(rig), tmp_path / "run", options)
-    monkeypatch.undo()
-    assert [path.is_file() for path in particle_files(tmp_path / "run")] == [True, True, False, False]
-    assert not (tmp_path / "run" / "tracks.vtkhdf").exists()
-    follow(rig, tmp_path / "run", "--threads", 2, "--resume")
-    assert bytes_of(tmp_path / "run") == bytes_of(followed)
-    # The frame after it is not made again.
-    made = particle_files(tmp_path / "run")[3].stat().st_mtime_ns
-    particle_files(tmp_path / "run")[2].unlink()
-    (tmp_path / "run" / "tracks.vtkhdf").unlink()
-    follow(rig, tmp_path / "run", "--threads", 1, "--resume")
-    assert bytes_of(tmp_path / "run") == bytes_of(followed)
-    assert particle_files(tmp_path / "run")[3].stat().st_mtime_ns == made
 
 
 @pytest.mark.thorough
@@ -265,6 +236,15 @@ def test_it_stops_before_its_time_limit_and_goes_on(
     follow(rig, output, *options, "--dry-run", "--resume", "--json")
     told = json.loads(capsys.readouterr().out)
     assert told["to_make"] == (FRAMES if ways else 1)
-    follow(rig, output, *options, "--time-limit", "1h", "--resume")
-    if not ways:
-        assert bytes_of(output) == bytes_of(followed)
+    follow(rig, output, "--threads", 2, *ways, "--time-limit", "1h", "--resume")
+    if ways:
+        return
+    # As if it had not stopped, on other threads; so does what has lost a file, and the frame after it is left alone.
+    assert bytes_of(output) == bytes_of(followed)
+    lost, last = particle_files(output)[2:]
+    made = last.stat().st_mtime_ns
+    lost.unlink()
+    (output / "tracks.vtkhdf").unlink()
+    follow(rig, output, *options, "--resume")
+    assert bytes_of(output) == bytes_of(followed)
+    assert last.stat().st_mtime_ns == made

@@ -81,29 +81,13 @@ def test_displacements_that_are_no_numbers_are_refused(tmp_path: Path, value: fl
         assert (code, "v.vtkhdf: a vector that counts as valid is not a finite number" in said) == (4, True), said
 
 
-@pytest.mark.thorough
-@pytest.mark.parametrize("kind", ["cut", "flipped", "zero tail", "version", "index"])
-def test_damaged_weights_reconstruct_nothing(tmp_path: Path, weights: Path, kind: str) -> None:
-    """At their end, within, in what they say of themselves, or in what they point at."""
-    broken, content = tmp_path / "broken.h5", bytearray(weights.read_bytes())
-    half = len(content) // 2
-    if kind == "cut":
-        del content[half:]
-    elif kind == "flipped":
-        content[half] ^= 1
-    elif kind == "zero tail":
-        content[half:] = bytes(len(content) - half)
-    broken.write_bytes(content)
-    if kind == "version":
-        with edited(broken) as file:
-            file.attrs["format_version"] = 999
-    elif kind == "index":
-        tree, made = read_tree(broken, FORMAT, VERSION)
-        tree["rows"]["cell"][7] = 10**6
-        form = {"format_name": FORMAT, "format_version": VERSION, "units": WEIGHT_UNITS}
-        write_tree(broken, tree, **form, provenance=made, overwrite=True)
+def test_weights_that_point_beyond_their_image_reconstruct_nothing(tmp_path: Path, weights: Path) -> None:
+    broken, form = tmp_path / "broken.h5", {"format_name": FORMAT, "format_version": VERSION, "units": WEIGHT_UNITS}
+    tree, made = read_tree(weights, FORMAT, VERSION)
+    tree["rows"]["cell"][7] = 10**6
+    write_tree(broken, tree, **form, provenance=made, overwrite=False)
     code, said = ended("reconstruct", broken, SAMPLE / "pair_a.tif", "-o", tmp_path / "v.vtkhdf")
-    assert (code, "broken.h5" in said, kind != "index" or "1000000" in said) == (4, True, True), said
+    assert (code, "broken.h5" in said, "1000000" in said) == (4, True, True), said
     assert not (tmp_path / "v.vtkhdf").exists()
 
 
