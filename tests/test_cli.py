@@ -14,7 +14,8 @@ import pytest
 from lfpiv_cli.cli.main import cli
 from lfpiv_cli.cli.options import GROUPS
 from lfpiv_cli.files import kernel_cache
-from tests.commands import AT_FOCUS, CONFIG, ROOT, SAMPLE, sample_rig
+from tests.commands import CONFIG, ROOT, SAMPLE
+from tests.test_faults_by_command import hear_interrupts
 
 
 def lfpiv(*arguments: object, **options: object) -> subprocess.CompletedProcess[str]:
@@ -95,23 +96,11 @@ def test_exit_codes_and_what_is_said(tmp_path) -> None:
     assert not target.exists()
 
 
-@pytest.mark.thorough
-def test_json_goes_to_stdout_alone(tmp_path) -> None:
-    done = lfpiv("build-weights", sample_rig(tmp_path, AT_FOCUS), "-o", tmp_path / "w.h5", "--json")
-    assert (done.returncode, done.stdout[0], done.stdout.count("\n"), done.stderr) == (0, "{", 1, "")
-
-
 def test_a_closed_pipe_is_quiet() -> None:
     done = subprocess.run(
         f"'{sys.executable}' -m lfpiv_cli --help | head -1", shell=True, capture_output=True, text=True, timeout=60
     )
     assert (done.returncode, done.stdout[:5], done.stderr) == (0, "Usage", "")
-
-
-def hear_interrupts():
-    """Have a new process hear SIGINT, which shells have their background jobs ignore, and SIGHUP, as nohup has it."""
-    for sent in (signal.SIGINT, signal.SIGHUP):
-        signal.signal(sent, signal.SIG_DFL)
 
 
 IGNORED_FIRST = """
@@ -180,37 +169,6 @@ def test_what_nohup_has_ignored_stays_so() -> None:
     assert (done.stdout, done.stderr) == ("here\n", "")
 
 
-@pytest.mark.thorough
-@pytest.mark.skipif(os.name == "nt", reason="Windows has no SIGTERM to send")
-@pytest.mark.parametrize(
-    ("sent", "code", "said"),
-    [("SIGTERM", 143, "terminated"), ("SIGINT", 130, "interrupted"), ("SIGHUP", 129, "hung up")],
-)
-def test_signals_end_the_work_and_leave_nothing(tmp_path, sent, code, said) -> None:
-    assert lfpiv("build-weights", sample_rig(tmp_path, AT_FOCUS), "-o", tmp_path / "w.h5").returncode == 0
-    # Compilation, which answers late, is over then.
-    assert lfpiv("reconstruct", tmp_path / "w.h5", SAMPLE / "pair_a.tif", "-o", tmp_path / "v.vtkhdf").returncode == 0
-    (tmp_path / "v.vtkhdf").unlink()
-    images = (tmp_path / "w.h5", SAMPLE / "pair_a.tif", "--iterations", "100000", "-o", tmp_path / "v.vtkhdf")
-    command = [sys.executable, "-m", "lfpiv_cli", "reconstruct", *(str(part) for part in images)]
-    for seconds in (4.0, 8.0, 16.0):
-        with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, preexec_fn=hear_interrupts) as process:
-            try:
-                time.sleep(seconds)
-                process.send_signal(getattr(signal, sent))
-                _, words = process.communicate(timeout=5.0)
-            finally:
-                # A work that goes on would keep the test from failing.
-                process.kill()
-        # On a busy machine Python may still be reading the program, which then cannot answer.
-        if process.returncode != -getattr(signal, sent):
-            break
-    assert process.returncode == code
-    assert f"lfpiv: {said}\n" in words
-    assert "Traceback" not in words
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["rig.yaml", "w.h5"]
-
-
 A_BROKEN_LIBRARY = """
 import signal, sys
 from lfpiv_cli.cli import main
@@ -272,14 +230,6 @@ def test_a_place_that_can_be_written_is_numbas_own_affair(process: pytest.Monkey
     (tmp_path / "file").write_text("")
     assert not kernel_cache._is_writable(tmp_path / "file" / "cache")
     assert kernel_cache._is_writable(tmp_path / "cache")
-
-
-def test_without_any_place_the_process_has_one_of_its_own(process: pytest.MonkeyPatch) -> None:
-    process.setattr(kernel_cache, "_is_writable", lambda path: False)
-    kernel_cache.ensure_place()
-    place = Path(os.environ[kernel_cache.VARIABLE])
-    assert place.is_dir()
-    assert kernel_cache.lost
 
 
 def test_a_filled_folder_that_is_read_only_is_copied(process: pytest.MonkeyPatch, tmp_path: Path) -> None:

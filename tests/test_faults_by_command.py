@@ -16,16 +16,15 @@ import pytest
 from lfpiv_cli.errors import OutputError
 from lfpiv_cli.files import inputs
 from lfpiv_cli.files.config import load_rig
-from lfpiv_cli.files.vtkhdf import open_vectors, write_vectors, write_volume
+from lfpiv_cli.files.vtkhdf import open_vectors, write_vectors
 from lfpiv_cli.flow.correlation import held_bytes
 from lfpiv_cli.flow.windows import CorrelationSettings
-from lfpiv_cli.grid import FOCAL_POINT, Grid
+from lfpiv_cli.grid import FOCAL_POINT
 from lfpiv_cli.validation.planning import depth_of_field_mm
 from lfpiv_cli.verbs import planning
 from tests.commands import AT_FOCUS, CONFIG, ROOT, SAMPLE, sample_rig
 from tests.hostile_files import ended
 from tests.test_batches import QUICK
-from tests.test_cli import hear_interrupts
 from tests.test_particle_stage import frames_of
 from tests.vector_fields import SHAPE, field_of
 
@@ -93,9 +92,12 @@ def test_two_commands_of_one_target_leave_one_whole_file(vectors: Path) -> None:
 
 
 NAMES = ("build-weights", "calibrate-snapshot", "simulate", "correlate", "track")
+THOROUGH = pytest.mark.thorough
 
 
-def work(name: str, folder: Path, pairs: list[Path], rng: np.random.Generator) -> tuple[list[str], str, float]:
+def work(
+    name: str, folder: Path, weights: Path, pairs: list[Path], rng: np.random.Generator
+) -> tuple[list[str], str, float]:
     """Return a command that works for a while, but for its output; how the name of that ends, and the seconds taken."""
     words: dict[str, tuple[object, ...]] = {
         "build-weights": (sample_rig(folder, AT_FOCUS),),
@@ -103,6 +105,7 @@ def work(name: str, folder: Path, pairs: list[Path], rng: np.random.Generator) -
         "simulate": ("white", CONFIG),
         "correlate": (*pairs[:2], "--windows", 8),
         "track": tuple(frames_of([300] * 3, folder, rng)) if name == "track" else (),
+        "reconstruct": (weights, SAMPLE / "pair_a.tif", "--iterations", 400),
     }
     end = {"build-weights": ".h5", "calibrate-snapshot": ".h5", "simulate": ""}.get(name, ".vtkhdf")
     begun = os.times().elapsed
@@ -114,8 +117,10 @@ def work(name: str, folder: Path, pairs: list[Path], rng: np.random.Generator) -
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="no SIGKILL")
 @pytest.mark.parametrize("name", NAMES)
-def test_what_was_killed_is_made_again(tmp_path: Path, pairs: list[Path], name: str, rng: np.random.Generator) -> None:
-    words, end, takes_s = work(name, tmp_path, pairs, rng)
+def test_what_was_killed_is_made_again(
+    tmp_path: Path, weights: Path, pairs: list[Path], name: str, rng: np.random.Generator
+) -> None:
+    words, end, takes_s = work(name, tmp_path, weights, pairs, rng)
     folder = tmp_path / "out"
     made, whole = folder / f"made{end}", tmp_path / f"made{end}"
     again = [*words, "--overwrite", "-o", str(made)]
@@ -132,21 +137,29 @@ def test_what_was_killed_is_made_again(tmp_path: Path, pairs: list[Path], name: 
     assert [path.name for path in folder.iterdir()] == [made.name]
 
 
-@pytest.mark.slow
+def hear_interrupts() -> None:
+    """Have a new process hear SIGINT, which shells have their background jobs ignore, and SIGHUP, as nohup has it."""
+    for sent in (signal.SIGINT, signal.SIGHUP):
+        signal.signal(sent, signal.SIG_DFL)
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="no SIGTERM to send")
-@pytest.mark.parametrize(("sent", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize(("sent", "code"), [("SIGTERM", 143), ("SIGINT", 130), ("SIGHUP", 129)])
+@pytest.mark.parametrize(
+    "name",
+    [*(pytest.param(name, marks=pytest.mark.slow) for name in NAMES), pytest.param("reconstruct", marks=THOROUGH)],
+)
 def test_signals_end_each_command_within_five_seconds(
-    tmp_path: Path, pairs: list[Path], name: str, sent: int, code: int, rng: np.random.Generator
+    tmp_path: Path, weights: Path, pairs: list[Path], name: str, sent: str, code: int, rng: np.random.Generator
 ) -> None:
-    words, end, takes_s = work(name, tmp_path, pairs, rng)
-    folder, ends = tmp_path / "out", []
+    words, end, takes_s = work(name, tmp_path, weights, pairs, rng)
+    folder, number, ends = tmp_path / "out", getattr(signal, sent), []
     for share in (0.5, 0.7, 0.9):
         command = [*words, "-o", folder / f"made{end}"]
         with subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, preexec_fn=hear_interrupts) as process:
             with suppress(subprocess.TimeoutExpired):
                 process.wait(share * takes_s)
-            process.send_signal(sent)
+            process.send_signal(number)
             try:
                 _, said = process.communicate(timeout=5.0)
             finally:
@@ -156,7 +169,7 @@ def test_signals_end_each_command_within_five_seconds(
         if process.returncode == 0:
             break
         # A process that still reads its libraries cannot answer yet.
-        assert process.returncode in (code, -sent)
+        assert process.returncode in (code, -number)
         assert not os.listdir(folder)
     assert code in ends
 
@@ -235,7 +248,6 @@ def contents(path: Path) -> dict[str, bytes]:
 
 
 STATUS = "Name:\tpython\nVmSize:\t 1000000 kB\nVmRSS:\t 500000 kB\n"
-SAMPLE_PAIR = (SAMPLE / "pair_a.tif", SAMPLE / "pair_b.tif")
 
 
 @pytest.fixture
@@ -251,16 +263,6 @@ def system(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return folder
 
 
-def volume_of_particles(path: Path, offset: int) -> Path:
-    """Write an empty volume but for some particles."""
-    grid = Grid.centred((16, 16, 16), (0.1, 0.1, 0.1), (0.0, 0.0, 0.0))
-    array = np.zeros(grid.shape_zyx)
-    array[4:12:4, 4:12:4, 4 + offset : 12 + offset : 4] = 1.0
-    told = {"residual": np.ones(1), "excluded_pixels": 0, "support_voxels": 1}
-    write_volume(path, array, grid, FOCAL_POINT, provenance={}, attributes=told, overwrite=False)
-    return path
-
-
 def test_each_limit_counts(system: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     inputs.ensure_room(10e9, "work")
     with pytest.raises(OutputError, match=r"work needs 11\.30 GB.* 10\.24 GB are left of this machine"):
@@ -269,6 +271,11 @@ def test_each_limit_counts(system: Path, monkeypatch: pytest.MonkeyPatch) -> Non
     inputs.ensure_room(1.9e9, "work")
     with pytest.raises(OutputError, match=r"2\.00 GB are left of this process's address space"):
         inputs.ensure_room(2.1e9, "work")
+    # Other systems set no limit.
+    monkeypatch.setattr(inputs, "address_space", lambda: None)
+    for name in ("PROCESS", "MACHINE", "CONTROL_GROUPS"):
+        monkeypatch.setattr(inputs, name, system / "none")
+    inputs.ensure_room(1e18, "work")
 
 
 @pytest.mark.parametrize(
@@ -288,28 +295,23 @@ def test_a_jobs_limit_holds_for_all_in_it(system: Path, line: str, file: str) ->
         inputs.ensure_room(2.1e9, "work")
 
 
-def test_other_systems_set_no_limit(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    for name in ("PROCESS", "MACHINE", "CONTROL_GROUPS"):
-        monkeypatch.setattr(inputs, name, tmp_path / "none")
-    monkeypatch.setattr(inputs, "address_space", lambda: None)
-    inputs.ensure_room(1e18, "work")
-
-
-def test_work_that_does_not_fit_is_not_begun(system: Path, tmp_path: Path, weights: Path, images: list[Path]) -> None:
-    pair = volume_of_particles(tmp_path / "a.vtkhdf", 0), volume_of_particles(tmp_path / "b.vtkhdf", 1)
-    target = tmp_path / "v.vtkhdf"
-    command = ("correlate", *pair, "--config", CONFIG, "--dt-s", 0.001, "--windows", 8, "-o", target)
-    (system / "meminfo").write_text("MemAvailable: 100 kB\n")
-    code, said = ended(*command)
-    assert code == 7
-    assert "too little memory: correlate needs 0.30 GB" in said
-    assert not target.exists()
-    command = ("reconstruct", weights, images[0], *QUICK, "-o", tmp_path / "v.vtkhdf")
-    for kilobytes, words in ((0, f"reading {weights} needs"), (1000, "reconstruct needs")):
+def test_work_that_does_not_fit_is_not_begun(
+    system: Path, tmp_path: Path, weights: Path, pairs: list[Path], images: list[Path]
+) -> None:
+    target, reconstruction = tmp_path / "v.vtkhdf", ("reconstruct", weights, images[0], *QUICK)
+    for command, kilobytes, words in (
+        (("correlate", *pairs[:2], "--windows", 8), 100, "too little memory: correlate needs 0.30 GB"),
+        (reconstruction, 0, f"reading {weights} needs"),
+        (reconstruction, 1000, "reconstruct needs"),
+    ):
         (system / "meminfo").write_text(f"MemAvailable: {kilobytes} kB\n")
-        code, said = ended(*command)
-        assert (code, words in said) == (7, True), said
-    assert not (tmp_path / "v.vtkhdf").exists()
+        code, said = ended(*command, "-o", target)
+        assert (code, words in said, target.exists()) == (7, True, False), said
+
+
+IMAGES = (SAMPLE / "pair_a.tif", SAMPLE / "pair_b.tif", "--white", SAMPLE / "white.tif")
+TOO_DEEP = ("[30, 22, 40]", "[4000, 4000, 4000]", "4000 x 4000 x 4000 voxels needs 512.30")
+TOO_WIDE = ("columns: 600, rows: 448", "columns: 20000, rows: 20000", "needs 13.90 GB")
 
 
 @pytest.mark.parametrize(
@@ -330,26 +332,21 @@ def test_a_correlation_takes_what_was_measured(
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "words", "said_of"),
+    ("command", "more", "change"),
     [
-        ("[30, 22, 40]", "[4000, 4000, 4000]", ("build-weights", "{rig}"), "4000 x 4000 x 4000 voxels needs 512.30"),
-        (
-            "[30, 22, 40]",
-            "[4000, 4000, 4000]",
-            ("run", "{rig}", *SAMPLE_PAIR),
-            "4000 x 4000 x 4000 voxels needs 512.30",
-        ),
-        ("[30, 22, 40]", "[800, 800, 800]", ("run", "{rig}", *SAMPLE_PAIR, "--method", "volumes"), "needs 16.70 GB"),
-        ("columns: 600, rows: 448", "columns: 20000, rows: 20000", ("simulate", "white", "{rig}"), "needs 13.90 GB"),
-        ("columns: 600, rows: 448", "columns: 20000, rows: 20000", ("simulate", "board", "{rig}"), "needs 13.90 GB"),
+        ("build-weights", (), TOO_DEEP),
+        ("run", IMAGES, TOO_DEEP),
+        ("run", (*IMAGES, "--method", "volumes"), ("[30, 22, 40]", "[800, 800, 800]", "needs 16.70 GB")),
+        ("simulate white", (), TOO_WIDE),
+        ("simulate board", (), TOO_WIDE),
     ],
 )
 def test_work_that_does_not_fit_is_refused_before_any(
-    system: Path, tmp_path: Path, old: str, new: str, words: tuple[object, ...], said_of: str
+    system: Path, tmp_path: Path, command: str, more: tuple[object, ...], change: tuple[str, str, str]
 ) -> None:
-    rig, output = sample_rig(tmp_path, AT_FOCUS, (old, new)), tmp_path / "output"
-    white = ("--white", SAMPLE / "white.tif") if words[0] == "run" else ()
-    code, said = ended(*(str(word).format(rig=rig) for word in words), *white, "-o", output)
+    *changed, said_of = change
+    rig, output = sample_rig(tmp_path, AT_FOCUS, tuple(changed)), tmp_path / "output"
+    code, said = ended(*command.split(), rig, *more, "-o", output)
     assert (code, said_of in said, "10.24 GB are left of this machine" in said) == (7, True, True), said
     assert not output.exists()
 
