@@ -317,18 +317,6 @@ def moved_light(a: Floats, b: Floats) -> float:
     return float(np.abs(a - b).sum() / a.sum())
 
 
-def test_plane_faces_make_the_images_of_plane_layers(small: Camera) -> None:
-    window = Window(98.0, 2.0)
-    path = fluid_path_to_focus(window, small.focus_distance_mm, WATER)
-    faces = CurvedSpace(WATER, (Face(Plane(-path - 2.0), 1.49), Face(Plane(-path), 1.33)))
-    balls = Balls(np.array([[0.05, -0.1, 3.0], [-0.2, 0.1, -4.0]]), np.array([1.0, 3.0]), np.array([0.05, 0.2]))
-    spaces = faces, ObjectSpace(WATER, window, "exact")
-    images = [render_points(small, space, balls, np.random.default_rng(5), rays=4000) for space in spaces]
-    assert images[0].sum() > 3.0
-    # 1e-6 mm move one ray of five thousand over a pixel's border
-    assert moved_light(*images) < 2e-3
-
-
 def test_images_behind_a_tube_are_those_of_rays_aimed_one_by_one(small: Camera) -> None:
     """With balls in the middle, and so near the rim that the polynomial does not do."""
     wide, rays = replace(small, columns=400, rows=2800), 3000

@@ -235,14 +235,6 @@ def test_pulsation_carries_tracers_as_its_equation_of_motion_does():
 
 
 @pytest.mark.thorough
-def test_duct_line_mean_by_quadrature():
-    """The flux through the section, by nested quadrature, does not depend on the series' own mean."""
-    flow = square_duct(2.0, 1.0)
-    line = lambda z: quad(lambda y: flow(np.array([[0.0, y, z]]))[0, 0], 0, 1, epsabs=1e-7)[0]  # noqa: E731
-    assert quad(line, 0, 1, epsabs=1e-6)[0] == pytest.approx(1.0, abs=1e-5)
-
-
-@pytest.mark.thorough
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_random_modes_have_their_rms_and_a_kolmogorov_spectrum(seed, rng):
     points = rng.uniform(-2000.0, 2000.0, (20000, 3))

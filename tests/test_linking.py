@@ -14,18 +14,10 @@ from lfpiv_cli.arrays import Flags, Floats, Integers
 from lfpiv_cli.grid import Scale
 from lfpiv_cli.synthetic.flows import Flow, advect, random_modes, rigid_rotation
 from lfpiv_cli.tracks import tracking
-from lfpiv_cli.tracks.candidates import (
-    NO_TRACK,
-    Candidates,
-    Light,
-    Seen,
-    common_displacements,
-    light_ratio,
-    long_ones,
-)
+from lfpiv_cli.tracks.candidates import NO_TRACK, Light, Seen, common_displacements, light_ratio, long_ones
 from lfpiv_cli.tracks.gridding import Structure, kriged, on_grid, structure_of
 from lfpiv_cli.tracks.sequences import PAST_FRAMES, REACH_FRAMES, PartialTracks, begun, expected_in, extended, follow
-from lfpiv_cli.tracks.tracking import ALONE, LEAST_LIGHT_RATIO, NEIGHBOURS, WIDTHS_LENSES, Forecast, marginals, track
+from lfpiv_cli.tracks.tracking import Forecast, marginals, track
 
 # The paper's seeding in a corner of its volume: particles half a millimetre apart.
 SMALL = Turbulence(side_mm=5.0)
@@ -187,29 +179,6 @@ def test_light_that_stays_tells_partners(rng: np.random.Generator) -> None:
     # The others are not taken for strangers, for whom it is 0.03, as they are where all errors are one.
     assert np.quantile(ratio[:, 0], 0.1) > 0.15
     assert np.median(alike[:, 0]) < 0.2
-
-
-def test_votes_are_the_sums_that_they_say(rng: np.random.Generator) -> None:
-    points, equal = rng.uniform(0.0, 2.0, (30, 3)), np.array([1.0, 1.0, 4.0])
-    first = np.sort(rng.integers(0, 30, 90))
-    displacement, ratio = rng.normal(0.0, 0.1, (90, 3)), rng.uniform(0.0, 2.0, 90)
-    ratio[::9] = 0.5 * LEAST_LIGHT_RATIO
-    found = tracking.votes(points, Candidates(first, first, displacement, ratio), 5.0, SCALE, equal)
-    taken = ratio > LEAST_LIGHT_RATIO
-    for c in range(90):
-        order = np.argsort(np.linalg.norm(points - points[first[c]], axis=1))[1 : NEIGHBOURS + 1]
-        support = 0.0
-        for neighbour in order:
-            alike = 0.0
-            for other in np.flatnonzero((first == neighbour) & taken):
-                off2 = np.sum(((displacement[other] - displacement[c]) / equal) ** 2)
-                for width in WIDTHS_LENSES:
-                    sigma = width * SCALE.lens_mm
-                    height = 1.0 / ((2.0 * np.pi) ** 1.5 * sigma**3 * 4.0 * len(WIDTHS_LENSES) * 5.0)
-                    near = off2 < (tracking.REACH * WIDTHS_LENSES[-1] * SCALE.lens_mm) ** 2
-                    alike += near * ratio[other] * height * np.exp(-0.5 * off2 / sigma**2)
-            support += np.log(ALONE + (1.0 - ALONE) * alike)
-        assert found[c] == (pytest.approx(support + np.log(ratio[c]), rel=1e-12) if taken[c] else -np.inf)
 
 
 def test_kriging_takes_a_linear_flow_exactly_also_from_one_plane(rng: np.random.Generator) -> None:
