@@ -149,18 +149,6 @@ def test_xarray_opens_vectors_of_several_times(tmp_path: Path, rng: np.random.Ge
         assert plane["u"].dims == plane["v"].dims == plane["chc"].dims == ("y", "x", "t")
 
 
-def test_pivpy_reads_a_plane(tmp_path: Path, rng: np.random.Generator) -> None:
-    pytest.importorskip("pivpy")
-    from pivpy import io, schema
-
-    source = write_kind("vectors", tmp_path, rng)
-    run("export", source, "--to", "netcdf", "--plane", 1, "-o", tmp_path / "plane.nc")
-    found = io.read_piv(tmp_path / "plane.nc")
-    schema.validate(found)
-    same(found["u"].values[..., 0], read_content(source).arrays["velocity"][1, :, :, 0])
-    assert found.attrs["delta_t"] == 0.002
-
-
 @pytest.mark.thorough
 def test_flowtracks_reads_the_tracks_of_a_sequence(tmp_path: Path, rng: np.random.Generator) -> None:
     flowtracks = pytest.importorskip("flowtracks.io")
@@ -195,17 +183,6 @@ def test_no_points_are_no_fault(name: str, tmp_path: Path, rng: np.random.Genera
 
 
 @pytest.mark.thorough
-def test_several_files_need_a_name_and_a_format_for_them(tmp_path: Path, rng: np.random.Generator) -> None:
-    paths = [tmp_path / "a.vtkhdf", tmp_path / "b.vtkhdf"]
-    for path in paths:
-        write_field(path, rng)
-    with pytest.raises(UsageError, match="whose name -o has to say"):
-        run("export", *paths, "--to", "netcdf")
-    with pytest.raises(UsageError, match="several go into netcdf, vtkhdf-series"):
-        run("export", *paths, "--to", "vti", "-o", tmp_path / "all.vti")
-
-
-@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("changes", "words"),
     [({"grid": Grid((4, 3, 3), GRID.spacing_mm, GRID.origin_mm)}, "on Grid"), ({"dt_s": 0.003}, "'dt_s': 0.003")],
@@ -221,11 +198,21 @@ def test_times_that_do_not_belong_together_are_refused(
     assert not (tmp_path / "all").exists()
 
 
-def test_files_and_planes_that_there_are_not_are_told(tmp_path: Path, rng: np.random.Generator) -> None:
-    with pytest.raises(UsageError, match="--plane 2: .* has 2 planes"):
-        run("export", write_kind("vectors", tmp_path, rng), "--to", "vti", "--plane", 2)
-    with pytest.raises(UsageError, match="no planes"):
-        run("export", write_kind("tracks", tmp_path, rng), "--to", "csv", "--plane", 0)
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("vectors vectors --to netcdf", "whose name -o has to say"),
+        ("vectors vectors --to vti -o all.vti", "several go into netcdf, vtkhdf-series"),
+        ("vectors --to vti --plane 2", "--plane 2: .* has 2 planes"),
+        ("tracks --to csv --plane 0", "no planes"),
+    ],
+)
+def test_what_formats_and_files_do_not_have_is_told(
+    words: str, said: str, tmp_path: Path, rng: np.random.Generator
+) -> None:
+    files = {kind: write_kind(kind, tmp_path, rng) for kind in ("vectors", "tracks")}
+    with pytest.raises(UsageError, match=said):
+        run("export", *(files.get(word, word) for word in words.split()))
 
 
 @pytest.mark.parametrize(("limit", "to"), [("LARGEST_BYTES", "mat"), ("LARGEST_VARIABLE", "netcdf")])
