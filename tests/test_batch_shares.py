@@ -11,7 +11,6 @@ import tifffile
 from lfpiv_cli.errors import InputError, PartialError, StoppedEarlyError, UsageError
 from lfpiv_cli.files import batch
 from lfpiv_cli.files.images import read_image
-from lfpiv_cli.files.inputs import Deadline
 from tests.commands import CONFIG, SAMPLE, run
 from tests.test_particle_stage import write_frame
 
@@ -50,13 +49,46 @@ def bytes_of(folder: Path | list[Path]) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in paths}
 
 
+@pytest.fixture(scope="module")
+def particles(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Particles of three pairs of frames."""
+    folder, rng = tmp_path_factory.mktemp("particles"), np.random.default_rng(20260101)
+    for pair in (1, 2, 3):
+        start = rng.uniform((-1.5, -1.1, -2.0), (1.5, 1.1, 2.0), (60, 3))
+        for name, moved in (("a", 0.0), ("b", 0.1)):
+            write_frame(folder / f"{pair}{name}.vtkhdf", start + (moved, 0.0, 0.0))
+    return folder
+
+
 @pytest.mark.thorough
-def test_shards_give_one_command_s_files(
-    weights: Path, frames: list[Path], volumes: list[Path], tmp_path: Path
+@pytest.mark.parametrize("how", ["shards", "workers"])
+@pytest.mark.parametrize("command", ["reconstruct", "correlate", "track"])
+def test_shards_and_workers_give_one_command_s_files(
+    weights: Path,
+    frames: list[Path],
+    volumes: list[Path],
+    particles: Path,
+    in_process: str,
+    tmp_path: Path,
+    command: str,
+    how: str,
 ) -> None:
-    for number in (3, 1, 2):
-        reconstruct(weights, frames, tmp_path / "v", "--shard", f"{number}/3")
-    assert bytes_of(tmp_path / "v") == bytes_of(volumes)
+    def work(output: str, *share: object) -> None:
+        options = (*share, "--log", tmp_path / f"log of {output}")
+        if command == "reconstruct":
+            reconstruct(weights, frames, tmp_path / output, *options)
+        elif command == "correlate":
+            correlate(volumes, tmp_path / output, *options)
+        else:
+            run("track", particles, "--pairing", "ab", "--quiet", *options, "-o", tmp_path / output)
+
+    work("one")
+    for share in [("--shard", f"{number}/3") for number in (3, 1, 2)] if how == "shards" else [("--dask", in_process)]:
+        work("many", *share)
+    assert bytes_of(tmp_path / "many") == bytes_of(tmp_path / "one")
+    assert len(bytes_of(tmp_path / "one")) == {"reconstruct": 5, "correlate": 4, "track": 3}[command]
+    done = [json.loads(line).get("done") for line in (tmp_path / "log of many").read_text().splitlines()]
+    assert how == "shards" or list(filter(None, done)) == list(range(1, 1 + max(filter(None, done))))
 
 
 @pytest.mark.thorough
@@ -79,26 +111,6 @@ def test_more_shards_than_frames_and_no_time_at_all(weights: Path, frames: list[
 
 
 @pytest.mark.thorough
-def test_workers_give_what_one_command_gives(
-    weights: Path,
-    frames: list[Path],
-    volumes: list[Path],
-    in_process: str,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    capsys.readouterr()
-    reconstruct(weights, frames, tmp_path / "v", "--dask", in_process, "--json", "--log", tmp_path / "log")
-    assert bytes_of(tmp_path / "v") == bytes_of(volumes)
-    assert json.loads(capsys.readouterr().out)["reconstructed"] == 5
-    events = [json.loads(line) for line in (tmp_path / "log").read_text().splitlines()]
-    assert [event["done"] for event in events if event["event"] == "frame"] == [1, 2, 3, 4, 5]
-    correlate(volumes, tmp_path / "one")
-    correlate(volumes, tmp_path / "many", "--dask", in_process)
-    assert bytes_of(tmp_path / "many") == bytes_of(tmp_path / "one")
-
-
-@pytest.mark.thorough
 def test_fields_of_shards_and_their_mean_by_a_last_command(volumes: list[Path], tmp_path: Path) -> None:
     correlate(volumes, tmp_path / "one", "--mean", tmp_path / "mean_one.vtkhdf")
     with pytest.raises(UsageError, match="--mean needs the fields of all shards.*without --shard and with --resume"):
@@ -110,43 +122,6 @@ def test_fields_of_shards_and_their_mean_by_a_last_command(volumes: list[Path], 
     assert bytes_of(tmp_path / "v") == bytes_of(tmp_path / "one")
     assert {path: path.stat().st_mtime_ns for path in (tmp_path / "v").iterdir()} == made
     assert (tmp_path / "mean.vtkhdf").read_bytes() == (tmp_path / "mean_one.vtkhdf").read_bytes()
-
-
-@pytest.mark.thorough
-def test_tracks_of_workers_and_shards(in_process: str, tmp_path: Path, rng: np.random.Generator) -> None:
-    particles = tmp_path / "particles"
-    particles.mkdir()
-    for pair in (1, 2):
-        start = rng.uniform((-1.5, -1.1, -2.0), (1.5, 1.1, 2.0), (60, 3))
-        for name, moved in (("a", 0.0), ("b", 0.1)):
-            write_frame(particles / f"{pair}{name}.vtkhdf", start + (moved, 0.0, 0.0))
-    for name, shares in {
-        "one": [()],
-        "dask": [("--dask", in_process)],
-        "shards": [("--shard", "1/2"), ("--shard", "2/2")],
-    }.items():
-        for share in shares:
-            run("track", particles, "--pairing", "ab", "--quiet", *share, "-o", tmp_path / name)
-    assert len(bytes_of(tmp_path / "one")) == 2
-    assert bytes_of(tmp_path / "dask") == bytes_of(tmp_path / "one")
-    assert bytes_of(tmp_path / "shards") == bytes_of(tmp_path / "one")
-
-
-@pytest.mark.thorough
-def test_a_batch_stops_before_its_time_limit_and_goes_on(
-    weights: Path, frames: list[Path], volumes: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    listed = tmp_path / "failures.json"
-    with monkeypatch.context() as clock:
-        # After two frames the third would not be done in time.
-        took = iter([0.1, 2000.0])
-        clock.setattr(Deadline, "took", lambda self, _seconds: setattr(self, "longest_s", next(took)))
-        with pytest.raises(StoppedEarlyError, match="2 of 5 frames are done; .*--resume"):
-            reconstruct(weights, frames, tmp_path / "v", "--time-limit", "30m", "--failures", listed)
-    assert len(bytes_of(tmp_path / "v")) == 2
-    assert json.loads(listed.read_text()) == []
-    reconstruct(weights, frames, tmp_path / "v", "--time-limit", "30m", "--resume")
-    assert bytes_of(tmp_path / "v") == bytes_of(volumes)
 
 
 class Filling:
