@@ -7,6 +7,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import time
 from contextlib import suppress
 from pathlib import Path
 
@@ -20,8 +21,7 @@ from lfpiv_cli.files.vtkhdf import open_vectors, write_vectors
 from lfpiv_cli.flow.correlation import held_bytes
 from lfpiv_cli.flow.windows import CorrelationSettings
 from lfpiv_cli.grid import FOCAL_POINT
-from lfpiv_cli.validation.planning import depth_of_field_mm
-from lfpiv_cli.verbs import planning
+from lfpiv_cli.verbs.planning import bench_of
 from tests.commands import AT_FOCUS, CONFIG, ROOT, SAMPLE, sample_rig
 from tests.hostile_files import ended
 from tests.test_batches import QUICK
@@ -360,14 +360,9 @@ def test_weights_that_the_disk_has_no_room_for_are_not_begun(tmp_path: Path, mon
     assert (code, "w.h5: needs 0.00 GB, and 0.00 GB are free on the disk" in said) == (7, True), said
 
 
-def test_a_volume_far_beyond_what_can_be_refocused_is_judged_at_its_end(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked = []
-    monkeypatch.setattr(
-        planning.planning, "in_miniature", lambda _camera, _media, depths_mm, *_: asked.append(depths_mm)
-    )
-    monkeypatch.setattr(planning.planning, "errors_by_depth_mm", lambda *_: np.ones((len(asked[0]), 3)))
-    settings = load_rig(CONFIG).overridden("volume", reference="focal_point", shape_xyz=(4000, 4000, 4000))
-    bench = planning.bench_of(settings, None)
-    assert bench.errors_mm.shape == (planning.DEPTHS, 3)
-    far = planning.FARTHEST_FIELDS * depth_of_field_mm(bench.camera, bench.media)
-    assert bench.bounds_mm[2, 1] > far == pytest.approx(asked[0].max())
+@pytest.mark.thorough
+def test_a_volume_far_beyond_what_can_be_refocused_is_judged_in_seconds() -> None:
+    settings, begun = load_rig(CONFIG).overridden("volume", reference="focal_point"), time.process_time()
+    benches = [bench_of(settings.overridden("volume", shape_xyz=(n, n, n)), None) for n in (40, 4000)]
+    assert benches[0].errors_mm.shape == benches[1].errors_mm.shape
+    assert time.process_time() - begun < 60.0

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from lfpiv_cli.arrays import Floats
-from lfpiv_cli.calibration.lattice import fit_lattice, lattice_vectors, without_strays
+from lfpiv_cli.calibration.lattice import fit_lattice, without_strays
 from lfpiv_cli.calibration.white import index_spots
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.optics.camera import Lattice
@@ -71,28 +71,8 @@ def test_whole_pixels_between_lens_images_are_no_distortion(pitch: float, rng: n
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize(
-    ("pitch", "angle_deg"), [(7.2, 44.0), (18.25, -0.12), (18.25, -44.0), (40.0, 20.0), (59.0, 1.0)]
-)
-def test_spectrum_finds_every_pitch_and_direction(pitch: float, angle_deg: float) -> None:
-    truth = Lattice.regular(pitch, "square", np.deg2rad(angle_deg), (300.0, 300.0))
-    basis, seen = lattice_vectors(discs(lens_centres(truth, (600, 600)), 0.48 * pitch, (600, 600)))
-    assert seen == "square"
-    # The walk takes a neighbour within a quarter of the pitch; a fiftieth leaves room for distortion.
-    np.testing.assert_allclose(basis, truth.basis, atol=pitch / 50)
-
-
-@pytest.mark.parametrize("angle_deg", [-29.0, 0.0, 12.0, 29.0])
-def test_spectrum_of_hexagons_turns_to_the_columns(angle_deg: float) -> None:
-    truth = Lattice.regular(17.0, "hexagonal", np.deg2rad(angle_deg), (130.0, 110.0))
-    basis, seen = lattice_vectors(discs(lens_centres(truth), 7.0))
-    assert seen == "hexagonal"
-    np.testing.assert_allclose(basis, truth.basis, atol=17.0 / 50)
-
-
-@pytest.mark.thorough
 @pytest.mark.parametrize("radius_per_pitch", [0.2, 0.45])
-@pytest.mark.parametrize(("pitch", "angle_deg"), [(6.1, 2.7), (10.3, -41.0), (23.0, 0.4), (60.0, -2.0)])
+@pytest.mark.parametrize(("pitch", "angle_deg"), [(6.1, 2.7), (7.2, 44.0), (10.3, -41.0), (23.0, 20.0), (60.0, -2.0)])
 def test_lattices_are_found_stopped_down_or_at_working_aperture(
     layout: str, pitch: float, angle_deg: float, radius_per_pitch: float, rng: np.random.Generator
 ) -> None:
@@ -104,7 +84,8 @@ def test_lattices_are_found_stopped_down_or_at_working_aperture(
     np.testing.assert_allclose(fit.lattice_px.pitch, truth.pitch, rtol=3e-4)
     # On hexagons the first vector is within 30 degrees of the columns: -41 is seen as 19.
     turn = np.rad2deg(fit.lattice_px.rotation_rad) - angle_deg
-    assert turn == pytest.approx(60.0 if layout == "hexagonal" and angle_deg < -30.0 else 0.0, abs=0.03)
+    beyond = layout == "hexagonal" and abs(angle_deg) > 30.0
+    assert turn == pytest.approx(-60.0 * np.sign(angle_deg) if beyond else 0.0, abs=0.03)
 
 
 def test_dirty_photographs(layout: str, rng: np.random.Generator) -> None:
