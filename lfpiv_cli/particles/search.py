@@ -154,7 +154,8 @@ class Task:
     depths_mm : between which particles may lie
     photons_per_count : of the camera; None: not known
     light_covariance : (2, 2) of the squares of size and diffusion, see `diffusion`; None: both are right
-    haze : (rows * columns,) what of the image is smooth over the sensor and no tracer's; None: nothing
+    haze, haze_error : (rows * columns,) what of the image is smooth over the sensor and no tracer's, and what all
+        pixels together may have more of it, standard errors; None: nothing
     """
 
     view: View
@@ -168,6 +169,7 @@ class Task:
     photons_per_count: float | None = None
     light_covariance: Floats | None = None
     haze: Floats | None = None
+    haze_error: Floats | None = None
 
     @cached_property
     def light(self) -> Floats:
@@ -237,6 +239,7 @@ def task_of(
     photons_per_count: float | None = None,
     light_covariance: Floats | None = None,
     haze: NDArray[np.float32] | None = None,
+    haze_error: NDArray[np.float32] | None = None,
 ) -> Task:
     """Return the task that an image sets.
 
@@ -248,7 +251,7 @@ def task_of(
     excluded : (rows, columns) raw pixels that take no part; `sums` must leave out what they touch; None: none
     photons_per_count : of the camera; None: taken from how bright particles are, until the fit shows it
     light_covariance : see `Task`
-    haze : (rows, columns) in the image; None: nothing
+    haze, haze_error : (rows, columns) in the image, and see `Task`; None: nothing
     """
     return Task(
         view,
@@ -261,7 +264,7 @@ def task_of(
         _depths_mm(view, *weights.grid.bounds_mm(2)),
         photons_per_count,
         light_covariance,
-        None if haze is None else haze.astype(np.float64).ravel(),
+        *(None if light is None else light.astype(np.float64).ravel() for light in (haze, haze_error)),
     )
 
 
@@ -408,11 +411,11 @@ def result(task: Task, state: State) -> Particles:
     images = (task.light - state.residual, state.residual, observation.weight)
     model, left, trust = (values.reshape(shape) for values in images)
     correlation = error_correlation(model, left, trust, state.noise)
-    changes = None
+    changes = [] if task.haze_error is None else [task.haze_error]
     if task.light_covariance is not None:
-        changes = changes_of_light(task.view, particles, task.light_covariance, task.depths_mm)
+        changes.extend(changes_of_light(task.view, particles, task.light_covariance, task.depths_mm))
     missing = missing_light(chi2, particles[:, 3], seen > LEAST_SEEN, lens_pixels(task.view))
-    covariance = joint_covariance(observation, particles, correlation, missing, changes)
+    covariance = joint_covariance(observation, particles, correlation, missing, np.array(changes) if changes else None)
     # Where there is a model: elsewhere is the light of particles that were not found.
     lit = task.usable & (task.light - state.residual > LIT_SIGMAS * state.noise.read_counts)
     noise = state.noise.of_dark(None if task.haze is None else task.haze[lit])
@@ -438,7 +441,7 @@ def result(task: Task, state: State) -> Particles:
     )
 
 
-# Errors that particles share: those of their size and the sensor's charge diffusion, and those of the model of light.
+# Errors that particles share: of their size and the sensor's charge diffusion, of haze, and of the model of light.
 #
 # They move the particles of an image all in one way: no fit shows them as noise.
 

@@ -38,6 +38,9 @@ DARK_PERCENTILE, BRIGHTER_PERCENTILE, DARK_LENS_PERCENTILE, FIELD_LENSES = 5.0, 
 # It moves to the mean of the pixels within this many standard deviations, smoothed over this many microlenses
 # (standard deviation); after so many rounds it moves by less than a hundredth of one.
 CORE_SIGMAS, SMOOTH_LENSES, ROUNDS = 1.5, 2.0, 12
+# Its error is so many times that of the mean of as many pixels, as the core moves with them: 1.4 by normal noise alone,
+# up to 2.4 on drawn rigs with tracers.
+CORE_ERROR = 2.0
 # At first haze is known to this share, by how uneven it is over a field; from round to round the standard deviation
 # falls to this share of itself at most.
 UNEVENNESS, COOLING = 0.15, 0.7
@@ -49,6 +52,8 @@ LEAST_DARK, LEAST_SIGMAS = 0.05, 2.5
 MUCH_DARK, LEAST_SIGMAS_OF_DARK = 0.15, 0.4
 # Fewer counts are what rounding leaves; a dark level that drifts is that of pixels between the lens images, too.
 LEAST_COUNTS = 1.0
+# Rounding hides so much of the level between lens images, above which haze is (standard error).
+ROUNDING_COUNTS = 0.29
 # How far below it noise is looked at, and how far to either side texture.
 BELOW_SIGMAS, NEAR_SIGMAS = 4.0, 2.0
 # Share of the variance that pixels side by side have in common: of haze of 50 to 5,000 counts, with up to 0.65 tracers
@@ -140,8 +145,11 @@ class White:
         plateau = (light.ravel() > PLATEAU * usual[lenses.number]) & (light.ravel() > 0.0)
         return cls(light, lenses, np.ascontiguousarray(places.T[::-1], np.float32), plateau)
 
-    def haze_in(self, picture: Singles, usable: Flags, background: tuple[float, float]) -> Haze | None:
-        """Return the haze in a raw picture (rows, columns) less its dark image; None where there is none for certain.
+    def haze_in(self, picture: Singles, usable: Flags, background: tuple[float, float]) -> tuple[Haze | None, float]:
+        """Return the haze in a raw picture (rows, columns) less its dark image, and its standard error in counts.
+
+        None where there is none for certain: what may be haze, and is too faint to take off, is an error. Where hardly
+        a pixel is dark nothing is known of it, and the error is 0.
 
         Parameters
         ----------
@@ -153,8 +161,8 @@ class White:
         light = (picture.ravel()[pixels].astype(np.float64) - level) / self.light.ravel()[pixels]
         found = self._darkest(pixels, light)
         if found is None:
-            return None
-        haze, sigma = found[0], max(found[1], noise, UNEVENNESS * float(np.median(found[0])))
+            return None, 0.0
+        haze, sigma = found[0], max(found[1], noise, UNEVENNESS * float(np.median(found[0])), LEAST_COUNTS)
         rest, whole = light - _between(haze, places), self._smoothed(pixels)
         for _ in range(ROUNDS):
             core = np.abs(rest) < CORE_SIGMAS * sigma
@@ -163,7 +171,7 @@ class White:
             # Where hardly a pixel is dark it is as in the nearest microlenses where some are.
             hidden = count < LEAST_DARK * whole
             if hidden.all():
-                return None
+                return None, 0.0
             haze = haze[tuple(distance_transform_edt(hidden, return_distances=False, return_indices=True))]
             rest = light - _between(haze, places)
             below = rest[(rest < 0.0) & (rest > -BELOW_SIGMAS * sigma)]
@@ -172,14 +180,16 @@ class White:
         middle = float(np.median(haze[self.lenses.of_some(pixels) > 0.0]))
         # Noise alone is below the haze as often as above.
         dark = 2.0 * float(np.mean(rest < 0.0)) > MUCH_DARK
+        told_by = 4.0 * np.pi * SMOOTH_LENSES**2 * float(np.median(count))
+        error = math.hypot(CORE_ERROR * sigma / math.sqrt(max(told_by, 1.0)), ROUNDING_COUNTS)
         if middle <= max((LEAST_SIGMAS_OF_DARK if dark else LEAST_SIGMAS) * sigma, LEAST_COUNTS):
-            return None
+            return None, math.hypot(middle, error) if dark else 0.0
         near = np.full(picture.shape, np.nan)
         near.ravel()[pixels] = np.where(np.abs(rest) < NEAR_SIGMAS * sigma, rest, np.nan)
         if _in_common(near) > LARGEST_TEXTURE:
-            return None
+            return None, 0.0
         lit = np.maximum(_between(haze, self.places), 0.0).reshape(picture.shape) * self.light
-        return Haze(lit.astype(np.float32), middle)
+        return Haze(lit.astype(np.float32), middle), error
 
     def _smoothed(self, pixels: Integers, values: Floats | None = None) -> Floats:
         """Return the sum of some pixels' values over microlenses (nj, ni), or their number, smoothed."""

@@ -263,22 +263,23 @@ class Bench:
             return self.excluded
         return self.excluded | of_images.touched(too_bright, self.content.weights.prepare)
 
-    def haze_in(self, lit: Image, unusable: Mask) -> Haze | None:
-        """Return the haze in a raw frame with dark or background taken off; None: none, or none that is certain.
+    def haze_in(self, lit: Image, unusable: Mask) -> tuple[Haze | None, float]:
+        """Return the haze in a raw frame with dark or background taken off, and its standard error in counts.
 
-        Few tracers leave most lens images dark, which takes less time to see than haze.
+        None: there is none, or none that is certain. Few tracers leave most lens images dark, which takes less time to
+        see than haze.
         """
         calibration = self.content.weights.calibration
         if calibration is None or calibration.white is None or not calibration.fit.lenses:
-            return None
+            return None, 0.0
         level, noise = self.lens_images.background(np.where(unusable, np.float32(np.nan), lit))
         column, row = np.clip(np.rint(calibration.fit.centres_px).astype(np.int64), 0, np.array(lit.shape[::-1]) - 1).T
         above = lit[row, column] - level
         dark = above[np.abs(above) < DARK_SIGMAS * noise]
         if dark.size > MOST_DARK * above.size and np.median(dark) < LEAST_SIGMAS * noise:
-            return None
+            return None, abs(float(np.median(dark)))
         white = white_of(calibration)
-        return None if white is None else white.haze_in(lit, ~unusable, (level, noise))
+        return (None, 0.0) if white is None else white.haze_in(lit, ~unusable, (level, noise))
 
     def sums_without(self, operator: Operator, excluded: Mask) -> Normalisers:
         """Return an operator's sums without what a frame excludes: from those that all frames share, if they do."""

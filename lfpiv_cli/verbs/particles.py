@@ -125,12 +125,14 @@ class Frame:
     unusable : (rows, columns) pixels that take no part
     sums : of the padded weights without what these touch
     haze : in the image; None: none
+    haze_error_counts : its standard error, also where none is certain
     """
 
     image: Image
     unusable: Mask
     sums: Normalisers
     haze: Haze | None = None
+    haze_error_counts: float = 0.0
 
     @property
     def light(self) -> Image:
@@ -167,7 +169,7 @@ def frame_of(bench: Bench, raw: Image, lit: Image) -> Frame:
     unusable = bench.unusable(raw)
     excluded = bench.excluded_with(unusable)
     sums = bench.sums_without(bench.content.weights.padded, excluded)
-    return Frame(filled(lit, unusable), unusable, sums, bench.haze_in(lit, unusable))
+    return Frame(filled(lit, unusable), unusable, sums, *bench.haze_in(lit, unusable))
 
 
 class Sized(NamedTuple):
@@ -246,6 +248,7 @@ def task_for(bench: Bench, frame: Frame) -> Task:
     margin = BEYOND_DEPTHS * content.camera.scale(bench.settings.media_model()).depth_mm
     low, high = content.weights.padded.grid.bounds_mm(2)
     view = _view(bench, light_of(bench.settings, (low - margin, high + margin)))
+    white = None if content.weights.calibration is None else content.weights.calibration.white
     return task_of(
         frame.image,
         view,
@@ -256,6 +259,7 @@ def task_for(bench: Bench, frame: Frame) -> Task:
         photons,
         bench.light_covariance,
         None if frame.haze is None else frame.haze.image,
+        None if white is None or frame.haze_error_counts == 0.0 else frame.haze_error_counts * white,
     )
 
 

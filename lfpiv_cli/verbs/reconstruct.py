@@ -101,7 +101,7 @@ def volume_of(
     unusable = bench.unusable(raw)
     excluded = bench.excluded_with(unusable)
     content = bench.content
-    haze, operator = bench.haze_in(lit, unusable), content.weights.padded
+    (haze, _), operator = bench.haze_in(lit, unusable), content.weights.padded
     light_of_tracers = lit if haze is None else lit - haze.image
     image = content.weights.prepare(filled(light_of_tracers, unusable))
     if bench.sums is None:
