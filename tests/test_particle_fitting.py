@@ -206,6 +206,17 @@ def test_neighbours_that_are_free_widen_the_errors_and_all_have_some(view: View)
 
 
 @pytest.mark.thorough
+def test_light_that_may_be_another_s_takes_a_place_along(view: View) -> None:
+    particles = np.array([[0.2, 0.1, 2.0, 4e3], [0.22, 0.1, 2.1, 3e3]])
+    found, jacobian = stated(view, particles), slopes_of(view, particles)
+    whole = np.linalg.inv((jacobian / (image_of(view, particles) + 36.0)) @ jacobian.T)
+    shared = np.outer(particles[1, :3] - particles[0, :3], particles[1, :3] - particles[0, :3])
+    more = (whole[3, 7] / particles[0, 3] ** 2) ** 2 * shared
+    assert np.sqrt(more[2, 2]) > 0.02
+    np.testing.assert_allclose(found[0, :3, :3] - whole[:3, :3], more, rtol=0.1, atol=0.02 * more[2, 2])
+
+
+@pytest.mark.thorough
 def test_what_all_particles_share_moves_them_as_a_fit_would(view: View) -> None:
     particles = np.array([[0.20, 0.10, 2.0, 5e5], [0.23, 0.09, 2.2, 4e5], [-1.0, 0.9, 1.0, 4e5]])
     clean = image_of(view, particles)

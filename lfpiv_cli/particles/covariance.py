@@ -9,6 +9,9 @@ pixels side by side. With H the normal matrix, K = H^-1 J^T W^(1/2) is how far e
 and errors with the correlation R move it by the covariance K R K^T. What a particle's chi-squared exceeds 1 by is not
 noise but such a sign: it counts as errors that are all alike.
 
+Two particles whose light is hardly told apart may share it otherwise: with I the light of one, d how far they are apart
+and c the covariance of their light, it moves by -c / I^2 d, of second order in what their light is uncertain by.
+
 What is wrong with the light of all particles together, as their size is, moves each by -H^-1 J^T W d with d what the
 image changes by.
 
@@ -108,7 +111,7 @@ def joint_covariance(
     pulls = _pulls(equations.slopes, shared, observation.optics.camera.columns)
     result = np.empty_like(equations.alone)
     in_threads(
-        lambda part: _covariances(equations, correlation, chi2, pulls, part.start, result[part]),
+        lambda part: _covariances(equations, particles, correlation, chi2, pulls, part.start, result[part]),
         blocks(len(particles), BLOCK),
     )
     return result
@@ -284,7 +287,13 @@ def _set_products(slopes: Slopes, n: int, m: int, common: NDArray[np.int64], blo
 
 @njit(cache=True, nogil=True)
 def _covariances(
-    equations: Equations, correlation: Correlation, chi2: Floats, pulls: Floats, first: int, result: Floats
+    equations: Equations,
+    particles: Floats,
+    correlation: Correlation,
+    chi2: Floats,
+    pulls: Floats,
+    first: int,
+    result: Floats,
 ) -> None:
     """Fill in the covariances of the particles from `first` on.
 
@@ -317,6 +326,13 @@ def _covariances(
                 of_m = inverse[:, UNKNOWNS * m : UNKNOWNS * (m + 1)]
                 _add_moves(equations.slopes, members[m], of_m, top, left, moved_by)
             _add_excess(moved_by, correlation.decay, correlation.share + excess, result[k])
+        # Light that one particle has and may be another's takes its place along, which slopes do not show.
+        for m in range(1, members.size):
+            taken = min(max(-inverse[3, UNKNOWNS * m + 3], 0.0) / particles[n, 3] ** 2, 1.0)
+            for a in range(3):
+                for b in range(3):
+                    far = (particles[members[m], a] - particles[n, a]) * (particles[members[m], b] - particles[n, b])
+                    result[k, a, b] += taken * taken * far
         # What errors that all particles share move it by.
         for shared in range(pulls.shape[2]):
             moved = np.zeros(UNKNOWNS)
