@@ -17,10 +17,6 @@ from lfpiv_cli.errors import UsageError
 # More than one, for pieces of work that do not take equally long; the threads wait for the last part.
 PARTS_A_THREAD = 4
 
-# For compiled functions that make no arrays: of every array that a function is given, in tuples too, numba counts the
-# references, which takes longer than what a short function does.
-COUNT_NO_REFERENCES = {"_nrt": False}
-
 # True in a process that was forked when OpenMP's threads ran, which were lost with that: another loop would end it.
 _lost_threads = False
 

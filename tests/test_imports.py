@@ -11,7 +11,7 @@ from tests.commands import ROOT
 PACKAGE = ROOT / "lfpiv_cli"
 # From the scene to the shell; what stands on one line may not know of a later line.
 LAYERS = (
-    {"arrays", "errors", "grid", "names", "neighbourhoods", "notice", "results", "robust", "threads"},
+    {"arrays", "errors", "grid", "kernels", "names", "neighbourhoods", "notice", "results", "robust", "threads"},
     {"simd"},
     # knows points, not images: nothing of ours beyond the grid
     {"tracks"},

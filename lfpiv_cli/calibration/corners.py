@@ -15,7 +15,6 @@ from typing import ClassVar
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from lfpiv_cli.arrays import Floats, Integers, Singles
@@ -26,6 +25,7 @@ from lfpiv_cli.calibration.shape_fit import PointShape, ShapeFit, fit_shape, pix
 from lfpiv_cli.calibration.views import clear_mm, described, lens_table
 from lfpiv_cli.calibration.wave_shapes import WaveLight, WaveShapes, corner_strips
 from lfpiv_cli.errors import InputError
+from lfpiv_cli.kernels import njit
 from lfpiv_cli.notice import written
 from lfpiv_cli.optics.camera import Camera, undistorted
 from lfpiv_cli.optics.media import Media

@@ -17,7 +17,6 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike
 
 from lfpiv_cli.arrays import Flags, Floats, Integers, Singles
@@ -28,6 +27,7 @@ from lfpiv_cli.calibration.rectification import turn_matrix
 from lfpiv_cli.calibration.shape_fit import RIM_PER_PATCH
 from lfpiv_cli.calibration.views import lens_table, sub_aperture_view, view_crossings
 from lfpiv_cli.errors import InputError
+from lfpiv_cli.kernels import njit
 from lfpiv_cli.optics.camera import Camera, with_entrance_pupil
 from lfpiv_cli.optics.media import Media, equivalent_object_distance
 from lfpiv_cli.optics.tracing import LARGEST_DEGREE, PolynomialRays, complete_exponents, polynomial_terms

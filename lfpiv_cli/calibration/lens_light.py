@@ -18,7 +18,6 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.special import ndtr
@@ -26,6 +25,7 @@ from scipy.special import ndtr
 from lfpiv_cli.arrays import Floats, Integers, Singles
 from lfpiv_cli.calibration.lattice import LatticeFit
 from lfpiv_cli.calibration.rectification import Rectification
+from lfpiv_cli.kernels import njit
 from lfpiv_cli.optics.camera import Lattice
 from lfpiv_cli.threads import share_out
 

@@ -12,13 +12,13 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike
 from scipy import ndimage
 
 from lfpiv_cli.arrays import EVERYWHERE, Flags, Floats, Integers, Singles
 from lfpiv_cli.calibration.lattice import EXPONENTS, LatticeFit
 from lfpiv_cli.errors import InputError
+from lfpiv_cli.kernels import njit
 from lfpiv_cli.names import ColumnAxis
 from lfpiv_cli.optics.camera import Lattice, nearest_point
 from lfpiv_cli.optics.line_responses import spline_weights

@@ -15,10 +15,10 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from lfpiv_cli.arrays import Floats, Singles
+from lfpiv_cli.kernels import njit
 from lfpiv_cli.optics.camera import Camera, Lattice, nearest_point, undistorted
 from lfpiv_cli.optics.media import Media, equivalent_object_distance
 

@@ -14,10 +14,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
 from lfpiv_cli.arrays import Floats, Integers
 from lfpiv_cli.calibration.shape_fit import PixelRays, SharesAndSlopes, Strips
+from lfpiv_cli.kernels import njit
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.line_responses import PHASES, LineResponses, line_responses, on_pixels, spline_weights
 from lfpiv_cli.optics.media import Media, equivalent_object_distance

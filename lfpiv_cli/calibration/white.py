@@ -9,13 +9,13 @@ from collections.abc import Sequence
 from itertools import pairwise
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from lfpiv_cli.arrays import Flags, Floats, Integers, Singles
 from lfpiv_cli.errors import InputError
+from lfpiv_cli.kernels import njit
 from lfpiv_cli.neighbourhoods import largest_around, smallest_around
 from lfpiv_cli.optics.camera import Lattice
 

@@ -17,7 +17,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import ClassVar, Self
 
-import numba
 import numpy as np
 
 from lfpiv_cli.arrays import Floats
@@ -34,6 +33,7 @@ from lfpiv_cli.fields.spline_field import (
     most_probable,
 )
 from lfpiv_cli.fields.structure import Samples, belonging, error_covariance, inverse_covariances, squares
+from lfpiv_cli.kernels import njit
 from lfpiv_cli.robust import MAD_TO_SIGMA
 
 # Gradients of a scalar as samples: what each spline has of them, and their part of the normal equations.
@@ -92,7 +92,7 @@ def right_hand_side(lattice: stencils.Lattice, points_mm: Floats, weighted: Floa
     return np.asarray(np.bincount(columns.ravel(), parts.ravel(), minlength=size), dtype=np.float64)
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def _add_rows(matrix, first, rows):  # type: ignore[no-untyped-def]  # numba
     """Add the squares of rows (n, m, 64), m of each sample, to the matrix of a scalar."""
     size = stencils.SUPPORT * stencils.SUPPORT * stencils.SUPPORT

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from functools import lru_cache
 from math import factorial
 
-import numba
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.interpolate import BSpline
@@ -20,6 +19,7 @@ from scipy.linalg import cholesky, solve_triangular
 from scipy.linalg.lapack import dpotri
 
 from lfpiv_cli.arrays import Flags, Floats, Integers
+from lfpiv_cli.kernels import njit
 from lfpiv_cli.threads import share_out
 
 # Cubic B-splines on a box: a lattice of knots, the four splines along each axis that reach a point, their integrals.
@@ -189,7 +189,7 @@ def add_samples(matrix: Stencil, lattice: Lattice, points_mm: Floats, weight: Fl
     share_out(_add_samples, len(matrix), matrix, first, x, y, z, np.ascontiguousarray(weight))
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def _add_samples(part, matrix, first, x, y, z, weight):  # type: ignore[no-untyped-def]  # numba
     """Add samples to the rows of some planes of x."""
     components = matrix.shape[1]

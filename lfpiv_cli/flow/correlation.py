@@ -16,7 +16,6 @@ from functools import reduce
 from operator import add
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
@@ -30,6 +29,7 @@ from lfpiv_cli.flow.peaks import ELONGATED_WIDTH, Peaks, absolute, find_peaks, t
 from lfpiv_cli.flow.sums import MapSums, map_sums, margins, valid_shares
 from lfpiv_cli.flow.windows import CorrelationSettings, Triple, WindowLayout, cells_of, triple
 from lfpiv_cli.grid import Grid
+from lfpiv_cli.kernels import njit
 from lfpiv_cli.threads import share_out
 
 # The coarse pass: windows twice the final ones at least (and those that come first), binned to about 16 cells, with

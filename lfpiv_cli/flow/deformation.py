@@ -13,13 +13,13 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 from lfpiv_cli.arrays import Flags, Floats, Singles
 from lfpiv_cli.flow.windows import Triple, WindowLayout
-from lfpiv_cli.threads import COUNT_NO_REFERENCES, share_out
+from lfpiv_cli.kernels import COUNT_NO_REFERENCES, njit
+from lfpiv_cli.threads import share_out
 
 # Sources lie between the first and the last voxel's centre: the four taps of a cubic B-spline reach one coefficient
 # beyond these, and a fifth of weight zero another.

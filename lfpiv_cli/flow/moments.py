@@ -18,13 +18,13 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from lfpiv_cli.arrays import Floats, Singles
 from lfpiv_cli.flow.sums import WeightedVoxels, weight_matrices, weighted_sums
 from lfpiv_cli.flow.windows import Starts, Triple, WindowLayout, cells_of, triple
-from lfpiv_cli.threads import COUNT_NO_REFERENCES, share_out
+from lfpiv_cli.kernels import COUNT_NO_REFERENCES, njit
+from lfpiv_cli.threads import share_out
 
 # Three components and the gain. Moments are those of their derivatives, and those of these with B - A.
 UNKNOWNS = 4

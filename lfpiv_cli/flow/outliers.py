@@ -9,7 +9,6 @@ Fields are (nz, ny, nx, 3); neighbours are the up to 26 around a vector.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, correlate1d, maximum_filter1d
 
@@ -17,6 +16,7 @@ from lfpiv_cli.arrays import Flags, Floats, Integers
 from lfpiv_cli.flow.field import MASKED, REJECTED, REPLACED, SECOND_PEAK, VALID
 from lfpiv_cli.flow.peaks import typical_width
 from lfpiv_cli.flow.windows import Triple, WindowLayout
+from lfpiv_cli.kernels import njit
 from lfpiv_cli.threads import share_out
 
 # The filter between passes, and what it says of the scales that a field does not resolve.

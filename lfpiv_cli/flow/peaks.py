@@ -9,11 +9,11 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numba import njit
 
 from lfpiv_cli.arrays import Flags, Floats
 from lfpiv_cli.flow.field import VectorField
 from lfpiv_cli.grid import Reference, Scale
+from lfpiv_cli.kernels import njit
 from lfpiv_cli.threads import share_out
 
 # Locking: near the focal plane volumes draw lateral displacements towards whole microlenses.

@@ -20,13 +20,13 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from lfpiv_cli.arrays import Floats, Singles
 from lfpiv_cli.flow.windows import Cells, Starts, Triple, WindowLayout, cells_of, triple
+from lfpiv_cli.kernels import COUNT_NO_REFERENCES, njit
 from lfpiv_cli.robust import of_half_the_sum
-from lfpiv_cli.threads import COUNT_NO_REFERENCES, in_threads, share_out
+from lfpiv_cli.threads import in_threads, share_out
 
 # Columns whose products are summed for all shifts before the next ones': their voxels stay in the fastest cache. And
 # shifts along x that share what is read: with five a radius of 2 takes one pass over a row.

@@ -12,11 +12,11 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike
 
 from lfpiv_cli.arrays import Floats, Integers
 from lfpiv_cli.grid import Scale
+from lfpiv_cli.kernels import njit
 from lfpiv_cli.names import ColumnAxis, Layout
 from lfpiv_cli.optics.media import Media
 

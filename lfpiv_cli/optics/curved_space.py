@@ -29,16 +29,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike
 
 from lfpiv_cli.arrays import Flags, Floats
 from lfpiv_cli.errors import ConfigError
+from lfpiv_cli.kernels import COUNT_NO_REFERENCES, njit
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media
 from lfpiv_cli.optics.shapes import RigidMotion, Shape, Vector, dot, plus, reliefs_of, scaled
 from lfpiv_cli.optics.surfaces import Faces, Surface, height_behind, meet, normal_change
-from lfpiv_cli.threads import COUNT_NO_REFERENCES
 
 # Rays through the faces by Snell's law, compiled: from the lens into the fluid, and from a point aimed.
 #

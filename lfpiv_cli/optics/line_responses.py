@@ -28,7 +28,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
@@ -36,9 +35,9 @@ from scipy.ndimage import spline_filter1d
 from scipy.special import j0
 
 from lfpiv_cli.arrays import Floats, Singles
+from lfpiv_cli.kernels import COUNT_NO_REFERENCES, njit
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.tracing import ObjectSpace, slope_ratios
-from lfpiv_cli.threads import COUNT_NO_REFERENCES
 
 # Spots' places per pitch at which responses are known, and samples of the array between two of them: lenses' edges lie
 # between samples. With half as many places tracers within half a depth unit of focus are off by three times as much.

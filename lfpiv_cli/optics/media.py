@@ -12,10 +12,10 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike
 
 from lfpiv_cli.arrays import Floats
+from lfpiv_cli.kernels import njit
 
 # Newton's iteration for the exact refraction starts from the paraxial ray and converges quadratically; below f/1.4 and
 # for n < 2 six steps reach 1e-15, the limit only guards against a ray that grazes.

@@ -11,14 +11,13 @@ from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 from lfpiv_cli.arrays import Floats, Integers
 from lfpiv_cli.errors import ConfigError
-from lfpiv_cli.threads import COUNT_NO_REFERENCES
+from lfpiv_cli.kernels import COUNT_NO_REFERENCES, njit
 
 Vector = tuple[float, float, float]
 

@@ -23,10 +23,10 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple, Protocol
 
 import numpy as np
-from numba import njit
 
 from lfpiv_cli.arrays import Floats
 from lfpiv_cli.errors import ConfigError
+from lfpiv_cli.kernels import COUNT_NO_REFERENCES, njit
 from lfpiv_cli.names import Facing, SurfaceKind
 from lfpiv_cli.optics.shapes import (
     NO_AXIS,
@@ -44,7 +44,6 @@ from lfpiv_cli.optics.shapes import (
     scaled,
     unit,
 )
-from lfpiv_cli.threads import COUNT_NO_REFERENCES
 
 
 class Surface(Protocol):

@@ -12,11 +12,11 @@ from functools import cache
 from itertools import product
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike
 
 from lfpiv_cli.arrays import Flags, Floats, Integers
 from lfpiv_cli.errors import ConfigError
+from lfpiv_cli.kernels import COUNT_NO_REFERENCES, njit
 from lfpiv_cli.names import Refraction, TracedMethod
 from lfpiv_cli.optics.camera import Camera, KernelCamera, nearest_point
 from lfpiv_cli.optics.media import (
@@ -28,7 +28,6 @@ from lfpiv_cli.optics.media import (
     object_space_matrix,
     snell_invariant,
 )
-from lfpiv_cli.threads import COUNT_NO_REFERENCES
 
 # Rays as a polynomial has them: where they meet the microlens array, fitted instead of traced.
 #

@@ -29,12 +29,12 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
 from scipy import fft
 from scipy.special import ndtr
 
 from lfpiv_cli.arrays import Flags, Floats, Singles
+from lfpiv_cli.kernels import njit
 from lfpiv_cli.optics.camera import Camera, nearest_point, undistorted
 from lfpiv_cli.optics.curved_space import CurvedSpace
 from lfpiv_cli.optics.tracing import ObjectSpace

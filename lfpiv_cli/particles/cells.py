@@ -12,11 +12,10 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from lfpiv_cli.arrays import Floats, Real
+from lfpiv_cli.kernels import COUNT_NO_REFERENCES, njit
 from lfpiv_cli.optics.camera import Lattice
-from lfpiv_cli.threads import COUNT_NO_REFERENCES
 from lfpiv_cli.weights.lens_cells import neighbours
 
 # How a pixel's patch of the main lens meets the round aperture: its covered share and where that share lies.

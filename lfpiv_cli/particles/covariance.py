@@ -23,11 +23,11 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from lfpiv_cli.arrays import Floats
+from lfpiv_cli.kernels import COUNT_NO_REFERENCES, njit
 from lfpiv_cli.particles.least_squares import (
     SUMS,
     UNKNOWNS,
@@ -39,7 +39,7 @@ from lfpiv_cli.particles.least_squares import (
 )
 from lfpiv_cli.particles.noise import Correlation
 from lfpiv_cli.particles.view import footprint_radius_mm, on_array_mm
-from lfpiv_cli.threads import COUNT_NO_REFERENCES, blocks, in_threads
+from lfpiv_cli.threads import blocks, in_threads
 
 # Neighbours that are left free: with twice as many the errors of 8,300 particles change by a thousandth.
 FREE_NEIGHBOURS = 12

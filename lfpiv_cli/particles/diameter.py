@@ -22,9 +22,9 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from lfpiv_cli.kernels import njit
 from lfpiv_cli.particles.diffusion import NO_FORMS, Forms, Together, forms_of, together_of
 from lfpiv_cli.particles.fitting import NO_FURTHER, Choice, begin_at, fit_best, judge
 from lfpiv_cli.particles.least_squares import (

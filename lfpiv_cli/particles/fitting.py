@@ -10,10 +10,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from lfpiv_cli.arrays import Floats
+from lfpiv_cli.kernels import COUNT_NO_REFERENCES, njit
 from lfpiv_cli.particles.least_squares import (
     CHOICE_GAIN,
     SMALLEST_GAIN,
@@ -35,7 +35,6 @@ from lfpiv_cli.particles.least_squares import (
 )
 from lfpiv_cli.particles.refraction import on_line_of_sight
 from lfpiv_cli.particles.view import View, entry_capacity, over_tiles
-from lfpiv_cli.threads import COUNT_NO_REFERENCES
 
 # Candidates are brought into the fit from these depths beside their own, in depths over which light spreads by one lens
 # (Table 2: 0.4 mm).

@@ -20,13 +20,13 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.spatial import KDTree
 
 from lfpiv_cli.arrays import Floats
 from lfpiv_cli.grid import Scale
+from lfpiv_cli.kernels import njit
 from lfpiv_cli.particles.fitting import NO_FURTHER, Choice, begin_at, fit_best, nothing_expected
 from lfpiv_cli.particles.least_squares import (
     CHOICE_GAIN,

@@ -19,17 +19,17 @@ from functools import cache
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
-from numba import cfunc, config, float64, njit, typeof, void
+from numba import cfunc, config, float64, typeof, void
 from numba.core.typing.templates import Signature
 from numba.core.typing.typeof import typeof_impl
 from numpy.typing import NDArray
 
 from lfpiv_cli.arrays import Floats, Singles
+from lfpiv_cli.kernels import COUNT_NO_REFERENCES, njit
 from lfpiv_cli.particles.line_light import VALUES, respond_by_lines
 from lfpiv_cli.particles.refraction import bend_of
 from lfpiv_cli.particles.rows import SLACK, Scratch, respond_rows, scratch
 from lfpiv_cli.particles.view import LARGEST_MOVE_LENSES, View, by_waves, entry_capacity, type_by_form
-from lfpiv_cli.threads import COUNT_NO_REFERENCES
 
 UNKNOWNS = 4
 # Damping relative to the diagonal: its start, and the factors after a step that failed or helped.

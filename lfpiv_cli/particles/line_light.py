@@ -12,16 +12,15 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from lfpiv_cli.kernels import COUNT_NO_REFERENCES, njit
 from lfpiv_cli.optics.line_responses import spline_slopes, spline_weights
 from lfpiv_cli.optics.tracing import slope_ratio
 from lfpiv_cli.particles.refraction import Bend, displaced
 from lfpiv_cli.particles.response import Along, Projection, lenses_of, project
 from lfpiv_cli.particles.view import View
 from lfpiv_cli.simd import LANES, ROWS, combine_rows
-from lfpiv_cli.threads import COUNT_NO_REFERENCES
 
 # Responses along one axis: the light's, and its derivatives by the spot's place and by depth.
 LIGHT, BY_OFFSET, BY_DEPTH = range(3)

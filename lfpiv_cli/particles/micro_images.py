@@ -16,12 +16,11 @@ from __future__ import annotations
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from lfpiv_cli.arrays import Real, Singles
+from lfpiv_cli.kernels import COUNT_NO_REFERENCES, njit
 from lfpiv_cli.particles.cells import HALF, ONE, QUARTER, THREE, TWO, ZERO, covered_share
-from lfpiv_cli.threads import COUNT_NO_REFERENCES
 
 # Columns that a block may have, and how many are worked on together.
 LONGEST, WIDTH = 96, 8

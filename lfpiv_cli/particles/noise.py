@@ -10,13 +10,13 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 
 from lfpiv_cli.arrays import Floats
+from lfpiv_cli.kernels import COUNT_NO_REFERENCES, njit
 from lfpiv_cli.robust import HALF_NORMAL_MEDIAN
-from lfpiv_cli.threads import COUNT_NO_REFERENCES, share_out
+from lfpiv_cli.threads import share_out
 
 # The optics model of a pixel's light is trusted to this share until what it leaves has been seen.
 MODEL_ERROR = 0.03

@@ -21,12 +21,11 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from lfpiv_cli.arrays import Floats
+from lfpiv_cli.kernels import COUNT_NO_REFERENCES, njit
 from lfpiv_cli.optics.curved_space import aim, slope_turns, start_at_lens, trace_pencil
 from lfpiv_cli.optics.surfaces import Faces
-from lfpiv_cli.threads import COUNT_NO_REFERENCES
 
 # Twelve nodes on the disc of radius 1 and their weights, exact up to degree 7 (Stroud's S2 7-1).
 _ROOT = np.sqrt(29.0)

@@ -19,14 +19,13 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from lfpiv_cli.arrays import Floats
+from lfpiv_cli.kernels import COUNT_NO_REFERENCES, njit
 from lfpiv_cli.optics.curved_space import aim, trace_in
 from lfpiv_cli.optics.tracing import slope_polynomial, slope_ratio
 from lfpiv_cli.particles.pencil import cubic_at, largest_of, pencil_of
 from lfpiv_cli.particles.view import View
-from lfpiv_cli.threads import COUNT_NO_REFERENCES
 
 # The shift changes by some 1e-3 of what a point moves: twice leaves a millionth of it.
 REPEATS = 2

@@ -24,16 +24,15 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from lfpiv_cli.arrays import Floats
+from lfpiv_cli.kernels import COUNT_NO_REFERENCES, njit
 from lfpiv_cli.particles.cells import BALL_VARIANCE, covered_share, level_at, share_at
 from lfpiv_cli.particles.micro_images import LONGEST
 from lfpiv_cli.particles.pencil import rises_at
 from lfpiv_cli.particles.refraction import Bend, displaced, largest_displacement
 from lfpiv_cli.particles.view import View
-from lfpiv_cli.threads import COUNT_NO_REFERENCES
 
 
 class Along(NamedTuple):

@@ -12,10 +12,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from lfpiv_cli.arrays import Floats, Singles
+from lfpiv_cli.kernels import COUNT_NO_REFERENCES, njit
 from lfpiv_cli.particles.micro_images import (
     AWAY,
     DOWN,
@@ -51,7 +51,6 @@ from lfpiv_cli.particles.response import (
     seen_moves,
 )
 from lfpiv_cli.particles.view import View
-from lfpiv_cli.threads import COUNT_NO_REFERENCES
 
 # A row of a micro-image is written up to a whole `WIDTH`: so many entries more than there are.
 SLACK = WIDTH

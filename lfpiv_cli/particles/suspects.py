@@ -8,12 +8,12 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from lfpiv_cli.arrays import Floats
 from lfpiv_cli.grid import Scale
+from lfpiv_cli.kernels import njit
 from lfpiv_cli.particles.fitting import NO_FURTHER, Choice, Elsewhere, fit_again, fit_best
 from lfpiv_cli.particles.least_squares import (
     CHOICE_GAIN,

@@ -15,9 +15,9 @@ from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
-from numba import njit
 
 from lfpiv_cli.arrays import Flags, Floats, Singles
+from lfpiv_cli.kernels import njit
 from lfpiv_cli.names import Start
 from lfpiv_cli.neighbourhoods import with_neighbours
 from lfpiv_cli.reconstruction.images import noise_residual

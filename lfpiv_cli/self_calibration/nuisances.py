@@ -15,13 +15,13 @@ from __future__ import annotations
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy.sparse import csc_matrix
 from scipy.sparse.linalg import lsqr
 
 from lfpiv_cli.arrays import Flags, Floats, Integers, Singles
 from lfpiv_cli.errors import ConfigError
+from lfpiv_cli.kernels import njit
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.curved_space import CurvedSpace
 from lfpiv_cli.optics.shapes import RigidMotion, vector

@@ -13,17 +13,16 @@ from __future__ import annotations
 from functools import cache
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import brentq
 from scipy.special import ndtri
 
 from lfpiv_cli.arrays import Flags, Floats
+from lfpiv_cli.kernels import COUNT_NO_REFERENCES, njit
 from lfpiv_cli.optics.camera import Camera, KernelCamera, Objective
 from lfpiv_cli.optics.curved_space import CurvedSpace, aim, aim_all
 from lfpiv_cli.optics.surfaces import Faces
 from lfpiv_cli.optics.tracing import struck_pixel, trace_ray
-from lfpiv_cli.threads import COUNT_NO_REFERENCES
 
 # Additive recurrence in four dimensions (aperture and ball): powers of the inverse of the root of x^5 = x + 1, whose
 # multiples fill the unit cube more evenly than random points do.

@@ -15,7 +15,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
 from scipy import fft
 from scipy.ndimage import map_coordinates
@@ -23,6 +22,7 @@ from scipy.special import ndtr, ndtri
 
 from lfpiv_cli.arrays import Floats, Integers
 from lfpiv_cli.errors import ConfigError
+from lfpiv_cli.kernels import njit
 from lfpiv_cli.optics.camera import Camera, KernelCamera, Objective, nearest_point
 from lfpiv_cli.optics.curved_space import CurvedSpace
 from lfpiv_cli.optics.media import Layers

@@ -15,11 +15,11 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from scipy.spatial import KDTree
 
 from lfpiv_cli.arrays import Flags, Floats, Integers
 from lfpiv_cli.grid import Scale
+from lfpiv_cli.kernels import njit
 from lfpiv_cli.robust import MAD_TO_SIGMA
 from lfpiv_cli.threads import share_out
 from lfpiv_cli.tracks.candidates import Candidates, Seen, candidates_of, common_displacements

@@ -11,12 +11,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from scipy.spatial import KDTree
 
 from lfpiv_cli.arrays import Flags, Floats, Integers, Singles
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.grid import Grid
+from lfpiv_cli.kernels import njit
 from lfpiv_cli.particles.joining import Boxes, find_peaks
 from lfpiv_cli.robust import MAD_TO_SIGMA
 from lfpiv_cli.validation.board import elongation_mm

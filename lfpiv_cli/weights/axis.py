@@ -20,10 +20,10 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from lfpiv_cli.arrays import Floats, Integers, Singles
+from lfpiv_cli.kernels import njit
 from lfpiv_cli.optics.tracing import slope_ratio
 from lfpiv_cli.threads import share_out
 from lfpiv_cli.weights.lens_cells import AxisOptics, Cells, cut, micro_image_cells, polygon_area, set_rectangle

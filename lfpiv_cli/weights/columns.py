@@ -16,11 +16,11 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numba import njit
 
 from lfpiv_cli.arrays import Flags, Floats, Integers, Singles
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.grid import Grid
+from lfpiv_cli.kernels import njit
 from lfpiv_cli.neighbourhoods import with_neighbours
 from lfpiv_cli.optics.camera import Camera, nearest_point
 from lfpiv_cli.optics.curved_space import CurvedSpace

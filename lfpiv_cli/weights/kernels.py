@@ -19,10 +19,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from lfpiv_cli.arrays import Integers, Singles
+from lfpiv_cli.kernels import njit
 from lfpiv_cli.simd import (
     COEFFICIENTS,
     GROUP,

@@ -8,11 +8,11 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from lfpiv_cli.arrays import Floats, Integers, Singles
 from lfpiv_cli.errors import ConfigError
+from lfpiv_cli.kernels import njit
 from lfpiv_cli.optics.camera import Camera, KernelCamera, Lattice
 from lfpiv_cli.threads import share_out
 

@@ -15,10 +15,10 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from lfpiv_cli.arrays import Floats, Integers, Singles
+from lfpiv_cli.kernels import njit
 from lfpiv_cli.optics.camera import Camera, KernelCamera
 from lfpiv_cli.optics.curved_space import CurvedSpace, aim
 from lfpiv_cli.optics.surfaces import Faces

@@ -13,10 +13,10 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from lfpiv_cli.arrays import Flags, Floats, Integers
 from lfpiv_cli.grid import Grid
+from lfpiv_cli.kernels import njit
 from lfpiv_cli.optics.camera import Camera, KernelCamera
 from lfpiv_cli.optics.curved_space import CurvedSpace, aim
 from lfpiv_cli.optics.surfaces import Faces

@@ -22,10 +22,10 @@ from functools import cached_property
 from typing import NamedTuple, Self, TypeVar
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from lfpiv_cli.arrays import Flags, Floats, Integers, Singles
+from lfpiv_cli.kernels import njit
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.curved_space import CurvedSpace
 from lfpiv_cli.optics.tracing import complete_exponents, polynomial_terms
