@@ -339,8 +339,10 @@ def verdict(outcome: Outcome) -> str:
     failed = [step for step in outcome.steps if step.exit_code]
     if failed:
         bug = failed[0].exit_code == 1
-        # Of an image that shows none, as it is said of it, nothing can be followed.
-        empty = failed[0].command == "track" and "no-particles" in codes(outcome.steps)
+        # Of an image that shows none nothing can be followed: the sentence ends with what was warned of it.
+        said = codes(outcome.steps)
+        explained = "no-particles" in said or failed[0].error.endswith(tuple(f"[{code}]" for code in said))
+        empty = failed[0].command == "track" and explained
         return "refused" if (failed[0].command in BEFORE_THE_WORK or empty) and not bug else "failed"
     # Nothing is stated that is wrong where no track was found.
     if "no-tracks" in codes(outcome.steps) and all("tracks of" in fault for fault in outcome.faults):

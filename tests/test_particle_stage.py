@@ -43,9 +43,9 @@ def write_frame(path: Path, position_mm: np.ndarray, **changes: object) -> None:
     n = len(position_mm)
     covariance = np.tile([1e-6, 1e-6, 1e-4, 0.0, 0.0, 0.0], (n, 1))
     arrays = {"intensity": np.ones(n), "covariance_mm2": covariance, "chi2": np.ones(n), "seen": np.ones(n)}
-    resolved = load_rig(CONFIG).resolved() | changes
+    record = {"warnings": changes.pop("warnings", [])} | {"config": load_rig(CONFIG).resolved() | changes}
     arrays["flag"] = np.zeros(n, np.uint8)
-    points = Points(position_mm, arrays, Reference("mid_plane", 0.5), {}, {"config": resolved})
+    points = Points(position_mm, arrays, Reference("mid_plane", 0.5), {}, record)
     particle_file.write_points(path, PARTICLES_FORMAT, points, overwrite=True)
 
 
@@ -121,8 +121,17 @@ def test_few_particles_are_tracked_and_said(
 def test_nothing_to_track_is_an_error_and_no_tracks_are_said(
     counts: list[int], tmp_path: Path, rng: np.random.Generator, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    with pytest.raises(InputError, match="no particles; tracks need some in two frames"):
-        run("track", *frames_of(counts, tmp_path, rng), "-o", tmp_path / "tracks.vtkhdf")
+    said = dict(
+        zip(
+            ("code", "about", "text", "remedy"), ("light-unexplained", "a.tif", "99% is left", "calibrate"), strict=True
+        )
+    )
+    paths = frames_of(counts, tmp_path, rng)
+    write_frame(paths[counts.index(0)], np.zeros((0, 3)), warnings=[said | {"code": "haze"}, said])
+    with pytest.raises(InputError, match="no particles; tracks need some in two frames") as refused:
+        run("track", *paths, "-o", tmp_path / "tracks.vtkhdf")
+    why = "in two frames at least; 99% is left; calibrate [light-unexplained]"
+    assert str(refused.value).endswith(why)
     assert not (tmp_path / "tracks.vtkhdf").exists()
     paths = frames_of([9, 9], tmp_path, rng)
     write_frame(paths[1], rng.uniform(8.0, 9.0, (9, 3)))

@@ -164,7 +164,7 @@ class Tracks(PairBatch[Outcome, TrackOptions]):
         # A pair is read once; of a sequence all that is kept of a frame is its record.
         read = lru_cache(maxsize=2)(partial(particle_file.read_points, format_name=particle_file.PARTICLES_FORMAT))
         counts, records = zip(*((frame.count, frame.provenance) for frame in map(read, paths)), strict=True)
-        of_tracks.ensure_particles(counts, names)
+        of_tracks.ensure_particles(counts, names, records)
         settings = of_tracks.settings_of(records, names, self._options.dt_s)
         chosen = of_tracks.tracking_of(
             settings, self._options.search_voxel, self._options.shortest, len(paths), names[0]

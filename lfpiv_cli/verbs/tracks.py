@@ -136,9 +136,10 @@ def track(
     """
     ensure_frames(len(particles), shortest)
     names = [f"frame {number}" for number in range(len(particles))]
-    settings = settings_of([each.provenance for each in particles], names, dt_s)
+    records = [each.provenance for each in particles]
+    settings = settings_of(records, names, dt_s)
     counts = [len(each.position_mm) for each in particles]
-    ensure_particles(counts, names)
+    ensure_particles(counts, names, records)
     chosen = tracking_of(settings, search_voxel, shortest, len(particles), names[0])
     found = tracked(particles, settings, chosen, record("track", settings.resolved() | chosen.reported(), {}))
     warn_of(few_notices(counts, names, found.summary, found.points))
@@ -226,11 +227,14 @@ def ensure_frames(frames: int, shortest: int | None) -> None:
         raise UsageError("--shortest is for sequences: two frames make tracks of two")
 
 
-def ensure_particles(counts: Sequence[int], names: Sequence[str]) -> None:
-    """Refuse frames of which not even two hold particles (InputError)."""
+def ensure_particles(counts: Sequence[int], names: Sequence[str], records: Sequence[Mapping[str, Any]]) -> None:
+    """Refuse frames of which not even two hold particles (InputError), with what was warned of when they were made."""
     if np.count_nonzero(counts) < 2:
-        empty = [name for name, count in zip(names, counts, strict=True) if not count]
-        raise InputError(f"{', '.join(empty)}: no particles; tracks need some in two frames at least")
+        empty = [number for number, count in enumerate(counts) if not count]
+        said = [each for number in empty for each in records[number].get("warnings", ()) if each["code"] != "haze"]
+        why = "".join(dict.fromkeys("; {text}; {remedy} [{code}]".format_map(each) for each in said))
+        files = ", ".join(names[number] for number in empty)
+        raise InputError(f"{files}: no particles; tracks need some in two frames at least{why}")
 
 
 def settings_of(
