@@ -2,7 +2,10 @@
 
 import inspect
 import json
+import os
 import pydoc
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -123,6 +126,17 @@ def test_same_bytes_for_any_number_of_threads(chain, tmp_path, threads) -> None:
         numba.set_num_threads(before)
     assert (tmp_path / "a.vtkhdf").read_bytes() == (chain / "volumes" / "pair_a.vtkhdf").read_bytes()
     assert (tmp_path / "v.vtkhdf").read_bytes() == (chain / "vectors.vtkhdf").read_bytes()
+
+
+@pytest.mark.slow
+def test_the_run_that_compiles_gives_the_bits_of_later_ones(chain, tmp_path) -> None:
+    """A kernel that others call is optimised in each of them: which copy runs depends on what was compiled here."""
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "kernels")}
+    command = ("reconstruct", chain / "weights.h5", SAMPLE / "pair_a.tif", "--dark", SAMPLE / "dark.tif", "-o")
+    for name in ("first", "later"):
+        words = [*command, tmp_path / f"{name}.vtkhdf", "--solver", "particles", "--no-residual"]
+        subprocess.run([sys.executable, "-m", "lfpiv_cli", *map(str, words)], env=environment, check=True)
+    assert (tmp_path / "first.vtkhdf").read_bytes() == (tmp_path / "later.vtkhdf").read_bytes()
 
 
 @pytest.mark.thorough

@@ -36,7 +36,7 @@ TINY = np.float32(1e-12)
 ZERO, QUARTER, HALF, ONE, TWO, THREE, FOUR, SIX = np.array([0.0, 0.25, 0.5, 1.0, 2.0, 3.0, 4.0, 6.0], np.float32)
 
 
-@njit(cache=True, fastmath=True, error_model="numpy", inline="always", **COUNT_NO_REFERENCES)
+@njit(cache=True, error_model="numpy", inline="always", **COUNT_NO_REFERENCES)
 def covered_share(x: Real, y: Real, width: Real, radius: Real) -> tuple[Real, Real, Real, Real, Real]:
     """Return C, the means of xi and eta, and the slopes of C along X and Y (per mm) of the patch centred at (x, y).
 

@@ -161,7 +161,7 @@ def _cell(view: View, lenses_mm: tuple[float, float, float], pixels: int, moved_
     return Cell(first, min(int(np.ceil(high)), pixels) - first, first - centre, moved_mm)
 
 
-@njit(cache=True, fastmath=True)
+@njit(cache=True)
 def _responses(view: View, along: Along, z: float, lenses_mm: NDArray[np.float64]) -> Lines:
     """Return responses (lenses, KINDS, phases, terms, pixels) under lenses at these places along one axis.
 
@@ -203,7 +203,7 @@ def _responses(view: View, along: Along, z: float, lenses_mm: NDArray[np.float64
     return found.reshape((lenses_mm.size, KINDS, phases, terms, width))
 
 
-@njit(cache=True, fastmath=True, **COUNT_NO_REFERENCES)
+@njit(cache=True, **COUNT_NO_REFERENCES)
 def _place(responses: Lines, kind: int, cell: Cell, signs: Lines, out: Lines, length: int) -> None:
     """Fill in the responses of a kind (KINDS, terms, length) of a cell's pixels, each term with a sign."""
     _, phases, terms, width = responses.shape
@@ -244,7 +244,7 @@ def _multiply(room: Room, size: tuple[int, int], kinds: tuple[int, int], value: 
             )
 
 
-@njit(cache=True, fastmath=True, **COUNT_NO_REFERENCES)
+@njit(cache=True, **COUNT_NO_REFERENCES)
 def _write_lens(
     view: View,
     projection: Projection,

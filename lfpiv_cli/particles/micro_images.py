@@ -44,7 +44,8 @@ SMALLEST_SHARE = np.float32(1e-9)
 # What the rim leaves of a patch that it does not touch: all; see `cells.covered_share`.
 WHOLE = (ONE, ZERO, ZERO, ZERO, ZERO)
 
-VECTORISED: dict[str, Any] = {"cache": True, "fastmath": True, "error_model": "numpy", **COUNT_NO_REFERENCES}
+# No fastmath: a kernel is optimised again in each that calls it, and in another order its sums have other last digits.
+VECTORISED: dict[str, Any] = {"cache": True, "error_model": "numpy", **COUNT_NO_REFERENCES}
 Four: TypeAlias = tuple[Real, Real, Real, Real]
 
 
