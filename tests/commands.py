@@ -34,6 +34,12 @@ def told(capsys: pytest.CaptureFixture[str], *arguments: object) -> dict[str, An
     return dict(json.loads(out))
 
 
+def contents(path: Path) -> dict[str, bytes]:
+    """Return what is in a file, or in all files of a folder and below, hidden ones too."""
+    files = [each for each in path.rglob("*") if each.is_file()] if path.is_dir() else [path]
+    return {str(file.relative_to(path)): file.read_bytes() for file in files}
+
+
 def changed(name: str, *changes: tuple[str, str]) -> str:
     """Return the text of a shipped config with pieces of it replaced, each of which must be there."""
     text = (ROOT / "configs" / f"{name}.yaml").read_text()

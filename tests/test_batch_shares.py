@@ -11,7 +11,7 @@ import tifffile
 from lfpiv_cli.errors import InputError, PartialError, StoppedEarlyError, UsageError
 from lfpiv_cli.files import batch
 from lfpiv_cli.files.images import read_image
-from tests.commands import CONFIG, SAMPLE, run
+from tests.commands import CONFIG, SAMPLE, contents, run
 from tests.test_particle_stage import write_frame
 
 
@@ -41,12 +41,6 @@ def reconstruct(weights: Path, frames: list[Path], output: Path, *options: objec
 
 def correlate(volumes: list[Path], output: Path, *options: object) -> None:
     run("correlate", *volumes, "--pairing", "sequence", "--windows", "4", "--quiet", *options, "-o", output)
-
-
-def bytes_of(folder: Path | list[Path]) -> dict[str, bytes]:
-    """Return what is in the files of a folder, hidden ones too."""
-    paths = folder if isinstance(folder, list) else folder.iterdir()
-    return {path.name: path.read_bytes() for path in paths}
 
 
 @pytest.fixture(scope="module")
@@ -85,8 +79,8 @@ def test_shards_and_workers_give_one_command_s_files(
     work("one")
     for share in [("--shard", f"{number}/3") for number in (3, 1, 2)] if how == "shards" else [("--dask", in_process)]:
         work("many", *share)
-    assert bytes_of(tmp_path / "many") == bytes_of(tmp_path / "one")
-    assert len(bytes_of(tmp_path / "one")) == {"reconstruct": 5, "correlate": 4, "track": 3}[command]
+    assert contents(tmp_path / "many") == contents(tmp_path / "one")
+    assert len(contents(tmp_path / "one")) == {"reconstruct": 5, "correlate": 4, "track": 3}[command]
     done = [json.loads(line).get("done") for line in (tmp_path / "log of many").read_text().splitlines()]
     assert how == "shards" or list(filter(None, done)) == list(range(1, 1 + max(filter(None, done))))
 
@@ -98,13 +92,13 @@ def test_the_share_of_an_array_job_is_made(
     for name, value in {"ID": 12, "MIN": 10, "COUNT": 3, "STEP": 2}.items():
         monkeypatch.setenv(f"SLURM_ARRAY_TASK_{name}", str(value))
     reconstruct(weights, frames, tmp_path / "v", "--shard", "slurm")
-    assert sorted(bytes_of(tmp_path / "v")) == ["1.vtkhdf", "2.vtkhdf"]
+    assert sorted(contents(tmp_path / "v")) == ["1.vtkhdf", "2.vtkhdf"]
 
 
 def test_more_shards_than_frames_and_no_time_at_all(weights: Path, frames: list[Path], tmp_path: Path) -> None:
     for number in range(1, 5):
         reconstruct(weights, frames[:2], tmp_path / "v", "--shard", f"{number}/4")
-    assert len(bytes_of(tmp_path / "v")) == 2
+    assert len(contents(tmp_path / "v")) == 2
     # A time limit that is over at once.
     with pytest.raises(StoppedEarlyError, match="0 of 5 frames are done"):
         reconstruct(weights, frames, tmp_path / "w", "--time-limit", "0.000001s")
@@ -119,7 +113,7 @@ def test_fields_of_shards_and_their_mean_by_a_last_command(volumes: list[Path], 
         correlate(volumes, tmp_path / "v", "--shard", f"{number}/2")
     made = {path: path.stat().st_mtime_ns for path in (tmp_path / "v").iterdir()}
     correlate(volumes, tmp_path / "v", "--mean", tmp_path / "mean.vtkhdf", "--resume")
-    assert bytes_of(tmp_path / "v") == bytes_of(tmp_path / "one")
+    assert contents(tmp_path / "v") == contents(tmp_path / "one")
     assert {path: path.stat().st_mtime_ns for path in (tmp_path / "v").iterdir()} == made
     assert (tmp_path / "mean.vtkhdf").read_bytes() == (tmp_path / "mean_one.vtkhdf").read_bytes()
 
@@ -163,7 +157,7 @@ def test_frames_that_come(
     told = json.loads(capsys.readouterr().out)
     assert (told["frames"], told["reconstructed"]) == (3, 3)
     alone(weights, frames[:3], tmp_path / "one")
-    assert bytes_of(tmp_path / "v") == bytes_of(tmp_path / "one")
+    assert contents(tmp_path / "v") == contents(tmp_path / "one")
     # once more, with one that never becomes whole
     (camera.folder / "9.tif").write_bytes(frames[0].read_bytes()[:9000])
     listed = tmp_path / "failures.json"
@@ -184,8 +178,8 @@ def test_pairs_that_come(pairing: str, volumes: list[Path], tmp_path: Path, monk
     monkeypatch.setattr(batch, "time", folder)
     run("correlate", folder.folder, *common, "--watch", "--idle-s", 20, "-o", tmp_path / "v")
     run("correlate", *named, *common, "-o", tmp_path / "one")
-    assert len(bytes_of(tmp_path / "one")) == (2 if pairing == "ab" else 3)
-    assert bytes_of(tmp_path / "v") == bytes_of(tmp_path / "one")
+    assert len(contents(tmp_path / "one")) == (2 if pairing == "ab" else 3)
+    assert contents(tmp_path / "v") == contents(tmp_path / "one")
 
 
 @pytest.mark.thorough
@@ -199,7 +193,7 @@ def test_a_lost_frame_of_a_folder_that_is_being_filled_is_told_at_once(
     monkeypatch.setattr(batch, "time", folder)
     with pytest.raises(PartialError, match="1 of 3 pairs failed, the first because the second frame of its pair"):
         run("correlate", folder.folder, "--pair-by", "{pair}{frame}", "--windows", 4, "--watch", "-o", tmp_path / "v")
-    assert sorted(bytes_of(tmp_path / "v")) == ["1a.vtkhdf", "3a.vtkhdf"]
+    assert sorted(contents(tmp_path / "v")) == ["1a.vtkhdf", "3a.vtkhdf"]
     assert capsys.readouterr().err.count("2a.vtkhdf: the second frame of its pair is missing") == 1
 
 
@@ -252,4 +246,4 @@ def test_particles_of_shards(weights: Path, frames: list[Path], options: tuple[s
     for share in ("1/1", "2/3", "1/3", "3/3"):
         folder, common = tmp_path / ("one" if share == "1/1" else "shards"), ("--solver", "particles", "--quiet")
         run("reconstruct", weights, *frames[:4], *common, *options, "--shard", share, "-o", folder)
-    assert bytes_of(tmp_path / "shards") == bytes_of(tmp_path / "one")
+    assert contents(tmp_path / "shards") == contents(tmp_path / "one")

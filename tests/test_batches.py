@@ -344,16 +344,23 @@ def test_two_workers_share_a_folder_and_a_killed_one_is_replaced(weights, raw, t
     }
 
 
-def test_a_dry_run_tells_and_writes_nothing(weights, images, tmp_path, capsys) -> None:
-    command = ("reconstruct", weights, *images, *QUICK, "-o", tmp_path / "out", "--failures", tmp_path / "failed.json")
+@pytest.mark.parametrize("command", ["reconstruct", "correlate"])
+def test_a_dry_run_tells_and_writes_nothing(weights, images, pairs, tmp_path, capsys, command) -> None:
+    given = {
+        "reconstruct": (weights, *images, *QUICK),
+        "correlate": (*pairs, "--pairing", "ab", "--windows", 8, "--derived"),
+    }[command]
+    words = (command, *given, "-o", tmp_path / "out", "--failures", tmp_path / "failed.json")
     before = stamps(tmp_path)
-    summary = told(capsys, *command, "--log", tmp_path / "log", "--dry-run")
+    summary = told(capsys, *words, "--log", tmp_path / "log", "--dry-run")
     assert stamps(tmp_path) == before
-    assert (summary["frames"], summary["to_make"], summary["skipped"], summary["unreadable"]) == (3, 3, 0, 0)
-    assert summary["would_make"] == [str(tmp_path / "out" / f"f{number}.vtkhdf") for number in range(3)]
+    made = ["f0", "f1", "f2"] if command == "reconstruct" else ["a0", "a1"]
+    assert (summary["to_make"], summary["skipped"], summary["unreadable"]) == (len(made), 0, 0)
+    assert summary["would_make"] == [str(tmp_path / "out" / f"{name}.vtkhdf") for name in made]
     assert (summary["seconds"], summary["seconds_by"]) == (None, None)
     assert summary["disk_by"] == "at most, uncompressed"
-    run(*command)
+    assert command == "reconstruct" or 300.0 < summary["memory_mb"] < 310.0
+    run(*words)
     written = sum(path.stat().st_size for path in (tmp_path / "out").iterdir()) / 1e6
     assert written < summary["disk_mb"] < 10.0 * written
 
@@ -380,7 +387,7 @@ def test_a_dry_run_believes_what_is_there_and_the_log(weights, images, tmp_path,
     assert "would_make" not in said
 
 
-def test_a_dry_run_ends_as_the_batch_would(weights, images, tmp_path, capsys) -> None:
+def test_a_dry_run_ends_as_the_batch_would(weights, images, pairs, tmp_path, capsys) -> None:
     output = ("-o", tmp_path / "out", "--dry-run")
     run("reconstruct", weights, *images[1:], *QUICK, *output[:2])
     with pytest.raises(OutputExistsError):
@@ -394,19 +401,18 @@ def test_a_dry_run_ends_as_the_batch_would(weights, images, tmp_path, capsys) ->
         capsys, "reconstruct", weights, *images, *QUICK, *output[:2], "--keep-going", "--resume", "--dry-run"
     )
     assert (summary["to_make"], summary["skipped"], summary["unreadable"]) == (0, 2, 1)
-
-
-def test_a_dry_run_of_pairs(pairs, tmp_path, capsys) -> None:
-    command = ("correlate", *pairs, "--pairing", "ab", "--windows", 8, "--derived", "-o", tmp_path / "out")
-    summary = told(capsys, *command, "--dry-run")
-    assert (summary["pairs"], summary["to_make"]) == (2, 2)
-    assert 300.0 < summary["memory_mb"] < 310.0
-    run(*command)
-    written = sum(path.stat().st_size for path in (tmp_path / "out").iterdir()) / 1e6
-    assert written < summary["disk_mb"] < 10.0 * written
-    bad = tmp_path / "b1.vtkhdf"
-    bad.write_bytes(pairs[3].read_bytes()[:-200])
-    command = ("correlate", *pairs[:3], bad, "--pairing", "ab", "--windows", 8, "-o", tmp_path / "two")
+    (tmp_path / "b1.vtkhdf").write_bytes(pairs[3].read_bytes()[:-200])
+    command = (
+        "correlate",
+        *pairs[:3],
+        tmp_path / "b1.vtkhdf",
+        "--pairing",
+        "ab",
+        "--windows",
+        8,
+        "-o",
+        tmp_path / "two",
+    )
     summary = told(capsys, *command, "--keep-going", "--dry-run")
     assert (summary["to_make"], summary["unreadable"]) == (1, 1)
 

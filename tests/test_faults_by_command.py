@@ -22,7 +22,7 @@ from lfpiv_cli.flow.correlation import held_bytes
 from lfpiv_cli.flow.windows import CorrelationSettings
 from lfpiv_cli.grid import FOCAL_POINT
 from lfpiv_cli.verbs.planning import bench_of
-from tests.commands import AT_FOCUS, CONFIG, ROOT, SAMPLE, sample_rig
+from tests.commands import AT_FOCUS, CONFIG, ROOT, SAMPLE, contents, sample_rig
 from tests.hostile_files import ended
 from tests.test_batches import QUICK
 from tests.test_particle_stage import frames_of
@@ -239,12 +239,6 @@ def test_an_extra_that_is_missing_gives_2_and_its_line(
     code, said = ended(*(word.format(vectors=vectors, folder=vectors.parent) for word in words))
     assert (code, f'pip install "lfpiv[{extra}]"' in said) == (2, True), said
     assert os.listdir(vectors.parent) == ["v.vtkhdf"]
-
-
-def contents(path: Path) -> dict[str, bytes]:
-    """Return the bytes of a file, or of all files in a folder."""
-    files = [each for each in path.rglob("*") if each.is_file()] if path.is_dir() else [path]
-    return {str(file.relative_to(path.parent)): file.read_bytes() for file in files}
 
 
 STATUS = "Name:\tpython\nVmSize:\t 1000000 kB\nVmRSS:\t 500000 kB\n"

@@ -17,7 +17,7 @@ from lfpiv_cli.files.inputs import Deadline
 from lfpiv_cli.files.particle_file import TRAJECTORIES_FORMAT, Points, read_points
 from lfpiv_cli.particles.view import raw_view
 from lfpiv_cli.verbs import follow as stage
-from tests.commands import run, sample_weights
+from tests.commands import contents, run, sample_weights
 from tests.particle_images import light_on
 
 FRAMES, COUNT = 4, 12
@@ -74,10 +74,6 @@ def particle_files(output: Path) -> list[Path]:
     return [output / "particles" / f"frame_{number}.vtkhdf" for number in range(FRAMES)]
 
 
-def bytes_of(output: Path) -> dict[str, bytes]:
-    return {str(path.relative_to(output)): path.read_bytes() for path in sorted(output.rglob("*")) if path.is_file()}
-
-
 def tracks_of(output: Path) -> Points:
     return read_points(output / "tracks.vtkhdf", TRAJECTORIES_FORMAT)
 
@@ -122,13 +118,13 @@ def test_the_same_in_memory(rig: Path, followed: Path, one_thread: Callable[[], 
 
 @pytest.mark.thorough
 def test_what_is_there_is_replaced_when_asked(rig: Path, followed: Path) -> None:
-    before = bytes_of(followed)
+    before = contents(followed)
     with pytest.raises(OutputExistsError):
         follow(rig, followed)
-    assert bytes_of(followed) == before
+    assert contents(followed) == before
     with pytest.raises(OutputExistsError, match="other inputs or settings"):
         follow(rig, followed, "--search", 3, "--resume")
-    assert bytes_of(followed) == before
+    assert contents(followed) == before
 
 
 def test_two_frames_or_a_share_are_refused(weights: Path, images: list[Path], tmp_path: Path) -> None:
@@ -240,11 +236,11 @@ def test_it_stops_before_its_time_limit_and_goes_on(
     if ways:
         return
     # As if it had not stopped, on other threads; so does what has lost a file, and the frame after it is left alone.
-    assert bytes_of(output) == bytes_of(followed)
+    assert contents(output) == contents(followed)
     lost, last = particle_files(output)[2:]
     made = last.stat().st_mtime_ns
     lost.unlink()
     (output / "tracks.vtkhdf").unlink()
     follow(rig, output, *options, "--resume")
-    assert bytes_of(output) == bytes_of(followed)
+    assert contents(output) == contents(followed)
     assert last.stat().st_mtime_ns == made
