@@ -10,7 +10,6 @@ from lfpiv_cli.optics.camera import Camera, Lattice
 from lfpiv_cli.optics.media import Media
 from lfpiv_cli.particles.view import Light, View, raw_view
 from lfpiv_cli.synthetic.render import Readout
-from lfpiv_cli.validation import planning
 from lfpiv_cli.validation.planning import UNKNOWNS, cramer_rao_bound, expected_image, pixel_variance, slopes
 
 # Two that overlap, and one alone on the other side of the focal plane.
@@ -114,7 +113,7 @@ def test_place_is_hardly_known_in_focus_and_not_at_all_off_the_sensor(view: View
 
 def test_variance_adds_up() -> None:
     light = np.array([-1.0, 0.0, 100.0])
-    base = 6.0**2 + planning.ROUNDING_VARIANCE
+    base = 6.0**2 + 1.0 / 12.0  # of rounding to whole counts
     assert pixel_variance(light, READOUT) == pytest.approx([base, base, base + 200.0])
     assert pixel_variance(light, replace(READOUT, photons_per_count=None)) == pytest.approx([base] * 3)
     assert pixel_variance(light, READOUT, counts_per_ray=10.0)[2] > base + 200.0

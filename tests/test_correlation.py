@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from lfpiv_cli.arrays import Flags, Floats, Singles
 from lfpiv_cli.errors import ConfigError, InputError
 from lfpiv_cli.flow.correlation import correlate, count_passes
-from lfpiv_cli.flow.deformation import SLACK, SPLINE_PAD, deform_pair, spline_coefficients, spline_matrix
+from lfpiv_cli.flow.deformation import deform_pair, spline_coefficients, spline_matrix
 from lfpiv_cli.flow.field import MASKED, REJECTED, VectorField
 from lfpiv_cli.flow.peaks import find_peaks, vertex
 from lfpiv_cli.flow.windows import CorrelationSettings, layout_windows
@@ -153,37 +153,6 @@ def test_deformation_brings_a_pair_together_but_where_either_source_is_unseen() 
     assert np.array_equal(np.flatnonzero(valid[5, 5]), [2, 3])
     np.testing.assert_allclose(got_a[5, 5], valid[5, 5], atol=1e-5)
     np.testing.assert_array_equal(got_a > 0.5, got_b > 0.5)
-
-
-def test_deformation_equals_the_spline_summed_by_hand_where_neighbours_move_apart(rng: np.random.Generator) -> None:
-    shape = (9, 8, 40)
-    a, b = rng.random((2, *shape)).astype(np.float32)
-    coefficients = [
-        volume.flat[SLACK:-SLACK].reshape([n + 2 * SPLINE_PAD for n in shape])
-        for volume in map(spline_coefficients, (a, b))
-    ]
-    # One spline node a voxel: neighbours that differ by up to nine voxels need more taps than are taken together.
-    field = rng.uniform(-4.5, 4.5, (*shape, 3))
-    along_z, along_y, along_x = (np.eye(n, dtype=np.float32) for n in shape)
-    nowhere = np.zeros((0, 0, 0), dtype=np.bool_)
-    splines = (spline_coefficients(a), spline_coefficients(b))
-    *found, valid = deform_pair(*splines, nowhere, field, (along_x, along_y, along_z), (0, 0, 0), (0, 0, 0))
-    places = np.argwhere(valid)[::37]
-    assert len(places) > 10
-    for place in places:
-        for volume, spline, sign in zip(found, coefficients, (-0.5, 0.5), strict=True):
-            source = place + SPLINE_PAD + sign * field[tuple(place)][::-1]
-            weights = [cubic_spline(np.arange(n) - s) for n, s in zip(spline.shape, source, strict=True)]
-            assert volume[tuple(place)] == pytest.approx(np.einsum("zyx,z,y,x", spline, *weights), abs=1e-5)
-    # The spline goes through the voxels.
-    whole = np.einsum("zyx,z,y,x", coefficients[0], *[cubic_spline(np.arange(n + 4) - 5) for n in shape])
-    assert whole == pytest.approx(a[3, 3, 3] / a.max(), abs=1e-6)
-
-
-def cubic_spline(away: Floats) -> Floats:
-    """The cubic B-spline, piece by piece."""
-    s = np.abs(away)
-    return np.where(s < 1, 2 / 3 - s**2 + s**3 / 2, np.where(s < 2, (2 - s) ** 3 / 6, 0.0))
 
 
 @pytest.mark.thorough

@@ -23,14 +23,13 @@ from lfpiv_cli.reconstruction.solvers import SolverSettings, reconstruct
 from lfpiv_cli.verbs.build_weights import BuildWeightsOptions, build_weights_file, misfit_notices
 from lfpiv_cli.verbs.reconstruct import reconstruct_files as reconstruct_images
 from lfpiv_cli.weights import strip_blocks
-from lfpiv_cli.weights import strips as of_strips
 from lfpiv_cli.weights.build import blur_radius_mm, factorise_through
 from lfpiv_cli.weights.columns import OnDemandOperator, operator_of, seen_share
 from lfpiv_cli.weights.kernels import STRIP
 from lfpiv_cli.weights.model import Weights
 from lfpiv_cli.weights.quadrature import RayCount, count_rays, integrate_columns, sampling_error
-from lfpiv_cli.weights.scene import aimed_misfit_mm, curved_padding, lit_voxels, places_on_array
-from lfpiv_cli.weights.strips import DEGREE_ALONG, StripOperator, evenly_spread, fit_axis, fit_part, mixed_shares
+from lfpiv_cli.weights.scene import aimed_misfit_mm, curved_padding, lit_voxels
+from lfpiv_cli.weights.strips import StripOperator, evenly_spread, mixed_shares
 from tests.commands import table2_rig
 from tests.known_rays import tube_of
 from tests.operators import assert_adjoint, column_image
@@ -221,25 +220,6 @@ def test_strips_meet_at_their_seams(table2, tube):
     steps = [np.abs(one - other).sum() for one, other in pairwise(profiles)]
     seam = STRIP - 1
     assert steps[seam] < 1.2 * max(steps[seam - 1], steps[seam + 1]) + 0.01
-
-
-def test_fits_of_a_strip_follow_its_rays(table2, tube):
-    centres = np.stack(np.meshgrid(np.arange(2.05, 3.6, 0.1), np.arange(1.05, 1.8, 0.1)), axis=-1).reshape(-1, 2)
-    rays = of_strips.strip_rays(table2, tube, centres, np.array([-2.0, 2.0]), np.array(VOXEL), 1, 4096)
-    for axis in (0, 1):
-        fit, left = fit_axis(rays, axis, DEGREE_ALONG if axis == 0 else None)
-        through = np.abs(rays.crossing_mm[:, 1 - axis]) < 1.0
-        _, rest = fit_part(fit, left, through)
-        assert np.sqrt(np.mean(rest**2)) < 0.7 * np.sqrt(np.mean(left**2))  # the other axis says less of these
-        # On one line and at one depth, as the factors take it.
-        line, depth, own = 2.55, 1.35, 0.3
-        bent = fit.bending(np.array([[depth]]), np.array([line]) if axis == 0 else None)
-        place = own if axis == 0 else line
-        crossing = np.zeros((1, 2))
-        shown, _ = places_on_array(table2, tube, np.array([[own, line, depth]]), crossing)
-        x = (place - rays.middle_mm[axis]) / bent.scale_mm[0]
-        taken = bent.coefficients_mm[0, 0, :, 0] @ x ** np.arange(bent.coefficients_mm.shape[-1])
-        assert taken == pytest.approx(shown[0, axis], abs=0.004)  # the mean over the other axis, not through its middle
 
 
 @pytest.mark.thorough

@@ -72,14 +72,6 @@ def test_structure_of_solenoidal_and_potential_parts(share: float) -> None:
         assert here[0] == pytest.approx(here[1], rel=1e-12)
 
 
-def test_slopes_of_the_structure_are_its_derivatives() -> None:
-    square, step = np.array([0.1, 1.0, 30.0]), 1e-6
-    model = structure(0.2)
-    above, below = model.parts(square + step), model.parts(square - step)
-    for found, high, low in zip(model.slopes(square), above, below, strict=True):
-        np.testing.assert_allclose(found, (high - low) / (2.0 * step), rtol=1e-6, atol=1e-12)
-
-
 def test_constants_are_kept_and_divergence_is_zero(field: KrigedField) -> None:
     moved = replace(field.samples, value_mm=field.samples.value_mm + [7.0, -3.0, 1.0])
     other = KrigedField(moved, field.structure, field.off_by, field.kept)

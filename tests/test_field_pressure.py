@@ -116,23 +116,6 @@ def test_the_matrix_of_gradients_is_that_of_a_small_box(rng):
     np.testing.assert_allclose(pressure.right_hand_side(BOX, samples.points_mm, weighted), right, atol=1e-10)
 
 
-def test_gradients_of_splines_are_their_differences(rng):
-    coefficients = rng.normal(size=BOX.shape)
-    points, step = rng.uniform(0.1, 1.9, (20, 3)), 1e-5
-    columns, _ = stencils.rows_of(BOX, points)
-    assert columns.shape == (20, 64)
-
-    def value(at):
-        columns, values = stencils.rows_of(BOX, at)
-        return np.sum(values * coefficients.ravel()[columns], axis=1)
-
-    found = pressure.gradient_at(points, BOX, coefficients)
-    for axis in range(3):
-        shift = step * np.eye(3)[axis]
-        slope = (value(points + shift) - value(points - shift)) / (2 * step)
-        np.testing.assert_allclose(found[:, axis], slope, atol=1e-6)
-
-
 @pytest.mark.thorough
 def test_poisson_a_fit_has_the_pressure_whose_gradient_accelerates_the_fluid(rng):
     """grad p = -rho a, of p = 3 (x^2 - y z) Pa per mm^2, which cubic splines hold exactly."""

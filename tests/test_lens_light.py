@@ -10,7 +10,7 @@ from scipy.ndimage import gaussian_filter
 from lfpiv_cli.arrays import Floats
 from lfpiv_cli.calibration import light_checks
 from lfpiv_cli.calibration.lattice import lattice_through
-from lfpiv_cli.calibration.lens_light import PARTS, Cells, LensImages, folded
+from lfpiv_cli.calibration.lens_light import Cells, LensImages, folded
 from lfpiv_cli.calibration.light_checks import blur_notices, dark_notices, level_notices, uniform_notices
 from lfpiv_cli.calibration.rectification import Rectification
 from lfpiv_cli.calibration.sheet import sheet_fit
@@ -60,24 +60,6 @@ def places() -> Floats:
 
 def codes(images: LensImages, picture: Floats) -> list[str]:
     return [notice.code for notice in light_checks.position_notices(images, picture, "a", "b")]
-
-
-@pytest.mark.thorough
-def test_folding_is_a_histogram(lattice: Lattice, rng: np.random.Generator) -> None:
-    picture, bins = rng.normal(1.0, 1.0, SHAPE), 8
-    picture[3, 5] = np.nan
-    expected = np.zeros((PARTS**2, bins, bins))
-    for row in range(SHAPE[0]):
-        for column in range(SHAPE[1]):
-            light = picture[row, column].astype(np.float32) - 0.5
-            u, v = lattice.coordinates((column, row)) * bins
-            part = row * PARTS // SHAPE[0] * PARTS + column * PARTS // SHAPE[1]
-            for m in (int(np.floor(v)), int(np.floor(v)) + 1):
-                for n in (int(np.floor(u)), int(np.floor(u)) + 1):
-                    if light > 0.0:
-                        expected[part, m % bins, n % bins] += light * (1.0 - abs(v - m)) * (1.0 - abs(u - n))
-    cells = Cells.of(lattice, SHAPE)
-    np.testing.assert_allclose(folded(picture, 0.5, cells, bins), expected, rtol=1e-6, atol=1e-6)
 
 
 def test_folding_follows_a_lattice_that_is_bent(lattice: Lattice, table2: Camera) -> None:

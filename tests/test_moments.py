@@ -10,7 +10,7 @@ from benchmarks.volumes import Seeding, volume_pair
 from lfpiv_cli.arrays import Floats, Singles
 from lfpiv_cli.flow.moments import gauss_newton, pair_moments
 from lfpiv_cli.flow.sums import margins
-from lfpiv_cli.flow.windows import WindowLayout, cells_of, layout_windows
+from lfpiv_cli.flow.windows import WindowLayout, layout_windows
 from lfpiv_cli.names import Weighting, names_in
 from tests.test_windows import weights_in
 
@@ -112,18 +112,6 @@ def test_windows_that_overhang_have_an_uncertainty_of_their_own(rng: np.random.G
     # Half the voxels, and some of the particles cut: a root of two more, or a little beyond. Of eight pairs 1.43 to
     # 1.67, in the mean 1.56 times the error of the inner ones; with nothing left out 1.06 to 1.34, in the mean 1.20.
     assert 1.38 < np.mean(over_inner) < 1.8
-
-
-@pytest.mark.parametrize(
-    ("size", "step", "per_window", "hop"), [(16, 8, 4, 2), (12, 6, 4, 2), (10, 5, 4, 2), (31, 16, 4, 4), (3, 3, 3, 3)]
-)
-def test_cells_make_up_each_window(size: int, step: int, per_window: int, hop: int) -> None:
-    cells = cells_of(WindowLayout((size, 8, 8), (step, 4, 4), (3, 1, 1), (0, 0, 0)))
-    assert (cells.per_window[2], cells.hop[2]) == (per_window, hop)
-    for window in range(3):
-        own = range(window * hop, window * hop + per_window)
-        voxels = [cells.start[2][cell] + np.arange(cells.size[2][cell]) for cell in own]
-        np.testing.assert_array_equal(np.concatenate(voxels), window * step + np.arange(size))
 
 
 @pytest.mark.parametrize("size", [(10, 10, 10), (12, 12, 12), (14, 14, 14), (18, 18, 18), (31, 31, 5), (24, 24, 4)])
