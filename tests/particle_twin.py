@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from lfpiv_cli.arrays import Floats
 from lfpiv_cli.particles import response
@@ -21,7 +21,7 @@ from lfpiv_cli.particles.cells import covered_share
 from lfpiv_cli.particles.micro_images import GAUSS_AT, GAUSS_WEIGHT, LONGEST, SMALLEST_SHARE
 from lfpiv_cli.particles.refraction import Bend, bend_of, displaced, is_seen
 from lfpiv_cli.particles.response import Along, Bent, Projection, bent_at, join_cell, lenses_of, lit_pixels, mean_width
-from lfpiv_cli.particles.view import View
+from lfpiv_cli.particles.view import View, entry_capacity
 
 # Rows of a profile: mean and slope of P, their derivatives by x and by z, the patch's middle, and how far from the
 # ball's middle the part of it is that is seen, times P.
@@ -212,3 +212,14 @@ def respond_once(view: View, x: float, y: float, z: float, pixels: NDArray[np.in
     np.add.at(sums, place, values[:entries])
     pixels[: named.size], values[: named.size] = named, sums
     return int(named.size)
+
+
+def twin_image(view: View, place: ArrayLike) -> Floats:
+    """Return light and derivatives of a particle of unit light as images (pixels, 4), pixel by pixel."""
+    capacity = entry_capacity(view, -5.0, 5.0)
+    pixels, values = np.empty(capacity, np.int32), np.empty((capacity, VALUES))
+    count = respond_once(view, *np.asarray(place, np.float64), pixels, values)
+    assert count < capacity
+    image = np.zeros((view.camera.rows * view.camera.columns, VALUES))
+    image[pixels[:count]] = values[:count]
+    return image

@@ -13,13 +13,13 @@ from lfpiv_cli.optics.media import Media, Window
 from lfpiv_cli.optics.surfaces import Plane
 from lfpiv_cli.optics.tracing import ObjectSpace, disc_points, trace
 from lfpiv_cli.particles.fitting import add_all, refine
-from lfpiv_cli.particles.least_squares import lit_by, observation_of, respond_all, room_for
+from lfpiv_cli.particles.least_squares import observation_of
 from lfpiv_cli.particles.pencil import MEAN_SQUARE, NODES, WEIGHTS, cubic_at, pencil_of
 from lfpiv_cli.particles.refraction import on_line_of_sight, places_by_snell
-from lfpiv_cli.particles.view import View, entry_capacity, footprint_radius_mm, on_array_mm, raw_view, tile_side_mm
+from lfpiv_cli.particles.view import View, footprint_radius_mm, on_array_mm, raw_view, tile_side_mm
 from tests.known_rays import image_of, tube_of
-from tests.particle_images import light_on
-from tests.particle_twin import respond_once
+from tests.particle_images import fit_moved, light_on, rows_image
+from tests.particle_twin import twin_image
 
 RADIUS_MM = 0.025
 DEPTHS = (-4.5, 4.5)
@@ -38,16 +38,6 @@ def camera(table2: Camera) -> Camera:
 @pytest.fixture(scope="module")
 def view(camera: Camera, water: Media) -> View:
     return raw_view(camera, water, RADIUS_MM, space=tube_of(water))
-
-
-def images(view: View, point: Floats) -> Floats:
-    """Return light and derivatives as images (pixels, 4)."""
-    responses = room_for(1, entry_capacity(view, *DEPTHS), 0)
-    respond_all(view, np.array([[*point, 1.0]]), responses)
-    pixels, values = lit_by(responses, 0)
-    result = np.zeros((view.camera.rows * view.camera.columns, 4))
-    np.add.at(result, pixels, values[:, : pixels.size].T)
-    return result
 
 
 def counted(camera: Camera, space: CurvedSpace, point: tuple[float, float, float], rays: int) -> Floats:
@@ -72,7 +62,7 @@ def test_response_is_what_rays_through_the_pipe_make(
         camera, place = replace(camera, columns=camera.rows, rows=camera.columns), (place[1], place[0], place[2])
         space = tube_of(water, (0.0, 1.0, 0.0))
     view = raw_view(camera, water, RADIUS_MM, space=space)
-    response = images(view, np.array(place))
+    response = rows_image(view, place)
     rays = 500_000
     traced = counted(camera, space, place, rays)
     assert response[:, 0].sum() == pytest.approx(1.0, abs=1e-3)
@@ -81,22 +71,18 @@ def test_response_is_what_rays_through_the_pipe_make(
     assert np.abs(response[:, 0] - traced).sum() < noise + 0.005
     if footprint_radius_mm(view, np.array([place]))[0] < 2.0 * view.half_x_mm:
         return  # one lens's width: next to nothing tells the place from the depth
-    lit = (response[:, 0] > 0.0) | (traced > 0.0)
-    columns = np.column_stack([response[lit, 1:], response[lit, 0]])
-    bias = np.linalg.lstsq(columns, (traced - response[:, 0])[lit], rcond=None)[0]
     # A fit to the rays would move by this.
-    assert np.abs(bias[:2]).max() < 5e-4
-    assert abs(bias[2]) < 4e-3
+    assert np.all(fit_moved(response, traced) < (5e-4, 5e-4, 4e-3))
 
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("place", PLACES)
 def test_derivatives_by_true_coordinates_are_finite_differences(view: View, place: tuple[float, float, float]) -> None:
-    analytic = images(view, np.array(place))
+    analytic = rows_image(view, place)
     for axis in range(3):
         step = np.zeros(3)
         step[axis] = 1e-4
-        ahead, behind = (images(view, np.array(place) + sign * step)[:, 0] for sign in (1.0, -1.0))
+        ahead, behind = (rows_image(view, np.array(place) + sign * step)[:, 0] for sign in (1.0, -1.0))
         difference = (ahead - behind) / 2e-4
         # Behind planes a hundredth. Here slopes are those of the light before what moves it by up to 9 um, a third of
         # the ball's radius: along x close to the wall, where the light hardly depends on it, a tenth.
@@ -109,15 +95,10 @@ def test_derivatives_by_true_coordinates_are_finite_differences(view: View, plac
 @pytest.mark.thorough
 @pytest.mark.parametrize("place", PLACES)
 def test_rows_are_the_pixels_one_by_one(view: View, place: tuple[float, float, float]) -> None:
-    capacity = entry_capacity(view, *DEPTHS)
-    pixels, values = np.empty(capacity, np.int32), np.empty((capacity, 4))
-    count = respond_once(view, *place, pixels, values)
-    assert 0 < count < capacity
-    slowly = np.zeros((view.camera.rows * view.camera.columns, 4))
-    np.add.at(slowly, pixels[:count], values[:count])
-    found, largest = images(view, np.array(place)), np.abs(slowly).max(axis=0)
+    slowly, quickly = twin_image(view, place), rows_image(view, place)
+    assert slowly.any()
     # Rows are in single precision.
-    np.testing.assert_allclose(found / largest, slowly / largest, atol=1e-4)
+    assert np.all(np.abs(quickly - slowly) < 1e-4 * np.abs(slowly).max(axis=0))
 
 
 @pytest.mark.thorough
@@ -127,9 +108,7 @@ def test_faces_that_are_plane_are_the_layers(table2: Camera, water: Media) -> No
     layers = ObjectSpace(water, Window(distance, 5.0), "exact")
     faces = CurvedSpace(water, (Face(Plane(-10.0), 1.49), Face(Plane(-5.0), 1.33)))
     for place in ((0.31, -0.2, 3.0), (0.2, 0.3, -4.0)):
-        by_layers, by_faces = (
-            images(raw_view(camera, water, RADIUS_MM, space=s), np.array(place)) for s in (layers, faces)
-        )
+        by_layers, by_faces = (rows_image(raw_view(camera, water, RADIUS_MM, space=s), place) for s in (layers, faces))
         # Layers take the slope's line from two places, faces from the disc: both differ from the rays by far less.
         assert np.abs(by_layers[:, 0] - by_faces[:, 0]).sum() < 1e-3
         for axis in (1, 2, 3):
@@ -165,7 +144,7 @@ def test_the_line_is_closest_to_the_slopes(camera: Camera, water: Media) -> None
 
 def test_what_the_wall_hides_has_no_light_and_footprints_hold_the_rest(view: View, camera: Camera) -> None:
     for place in ((0.1, 4.9, 3.0), (0.0, 5.5, 0.0), (0.0, 0.0, -6.0)):
-        assert not images(view, np.array(place)).any()
+        assert not rows_image(view, place).any()
     points = np.array([(0.1, 4.9, 3.0), (0.1, 3.0, 1.0)])
     assert np.isfinite(on_array_mm(view, points)).all()
     assert np.isfinite(footprint_radius_mm(view, points)).all()
@@ -174,7 +153,7 @@ def test_what_the_wall_hides_has_no_light_and_footprints_hold_the_rest(view: Vie
     assert on_line_of_sight(view, 0.1, 0.2, 0.0, 6.0) == (0.1, 0.2)
     columns = np.arange(view.camera.rows * view.camera.columns)
     for place in PLACES:
-        lit = np.flatnonzero(images(view, np.array(place))[:, 0])
+        lit = np.flatnonzero(rows_image(view, place)[:, 0])
         row, column = np.divmod(columns[lit], view.camera.columns)
         point = np.array([place])
         on_array = camera.px_to_mm(np.column_stack([column, row])) - on_array_mm(view, point)
@@ -201,7 +180,7 @@ def test_fits_return_to_the_truth_and_scatter_as_stated(camera: Camera, water: M
         true = np.array([[*place, 4e4]])
         model = light_on(view, true, DEPTHS)
         sigma = np.sqrt(model + 36.0)
-        values = images(view, np.array(place))
+        values = rows_image(view, place)
         slopes = np.column_stack([4e4 * values[:, 1:], values[:, 0]])
         stated = np.linalg.inv(slopes.T @ (slopes / sigma[:, np.newaxis] ** 2))
         errors = []

@@ -5,19 +5,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lfpiv_cli.arrays import Floats
 from lfpiv_cli.names import Layout
 from lfpiv_cli.optics.camera import Camera, Lattice
 from lfpiv_cli.optics.media import Media, Window, exact_lateral_mm
 from lfpiv_cli.optics.tracing import ObjectSpace
 from lfpiv_cli.particles.cells import cell_shares, covered_share, level_at, share_at
 from lfpiv_cli.particles.fitting import add_all, refine
-from lfpiv_cli.particles.least_squares import lit_by, observation_of, respond_all, room_for
+from lfpiv_cli.particles.least_squares import observation_of
 from lfpiv_cli.particles.noise import Noise, pixel_weights
 from lfpiv_cli.particles.refraction import paraxial_shift, places_by_snell
-from lfpiv_cli.particles.view import View, entry_capacity, raw_view
+from lfpiv_cli.particles.view import View, raw_view
 from lfpiv_cli.synthetic.render import Balls, render_points
-from tests.particle_twin import respond, respond_once
+from tests.particle_images import fit_moved, rows_image, rows_of
+from tests.particle_twin import twin_image
 
 RADIUS_MM = 0.025
 # In, near and out of focus, on both sides, off the axis; light goes through 1 to 50 lenses.
@@ -37,21 +37,10 @@ def view(small: Camera, water: Media) -> View:
     return raw_view(small, water, RADIUS_MM)
 
 
-def images(view: View, point: tuple[float, float, float]) -> Floats:
-    """Return light and derivatives as images (pixels, 4)."""
-    capacity = entry_capacity(view, -5.0, 5.0)
-    pixels, values = np.empty(capacity, np.int32), np.empty((capacity, 4))
-    count = respond(view, *point, pixels, values)
-    assert count < capacity
-    result = np.zeros((view.camera.rows * view.camera.columns, 4))
-    np.add.at(result, pixels[:count], values[:count])
-    return result
-
-
 @pytest.mark.thorough
 @pytest.mark.parametrize("place", PLACES)
 def test_response_is_what_rays_make(small: Camera, view: View, water: Media, place: tuple[float, float, float]) -> None:
-    response = images(view, place)
+    response = twin_image(view, place)
     rays = 1_000_000
     space = ObjectSpace(water, None, "paraxial")
     traced = render_points(
@@ -63,13 +52,9 @@ def test_response_is_what_rays_make(small: Camera, view: View, water: Media, pla
     assert np.abs(response[:, 0] - traced).sum() < noise + 0.005
     if abs(place[2]) < 0.1:
         return  # all light passes one lens, whichever way the particle moves within it: no position to compare
-    lit = (response[:, 0] > 0.0) | (traced > 0.0)
-    bias = np.linalg.lstsq(
-        np.column_stack([response[lit, 1:], response[lit, 0]]), (traced - response[:, 0])[lit], rcond=None
-    )[0]
+    bias = fit_moved(response, traced)
     # A fit to the rays would move by this: a thousandth of a voxel's width, and three hundredths in depth.
-    assert np.abs(bias[:2]).max() < 3e-4
-    assert abs(bias[2]) < 3e-3
+    assert np.all(bias < (3e-4, 3e-4, 3e-3))
 
 
 @pytest.mark.thorough
@@ -82,9 +67,9 @@ def test_derivatives_are_finite_differences(
     # Smaller steps would see where entries of the hexagons' table meet.
     step = np.zeros(3)
     step[axis] = (1e-3 if axis < 2 else 1e-2) if hexagonal else 1e-4
-    ahead, behind = (images(view, tuple(np.array(place) + sign * step))[:, 0] for sign in (1, -1))
+    ahead, behind = (twin_image(view, np.array(place) + sign * step)[:, 0] for sign in (1, -1))
     difference = (ahead - behind) / (2.0 * step[axis])
-    analytic = images(view, place)[:, 1 + axis]
+    analytic = twin_image(view, place)[:, 1 + axis]
     # The first moments' own slopes are left out: a hundredth of all, seen where a particle in focus hardly changes.
     # Hexagonal cells take a patch's mean slope for the slope of its middle: another hundredth.
     share = 0.02 if hexagonal else 0.01
@@ -94,12 +79,12 @@ def test_derivatives_are_finite_differences(
 def test_distortion_moves_the_light_and_each_lens_has_its_own_centre(view: View) -> None:
     place = (0.6, -0.5, 2.0)
     straight = view._replace(camera=view.camera._replace(distortion_per_mm2=0.0))
-    with_it, without = (images(v, place)[:, 0] for v in (view, straight))
+    with_it, without = (twin_image(v, place)[:, 0] for v in (view, straight))
     # k1 r^3 = 1e-4 mm of a lens of 0.1 mm: about 2e-3 of the light changes lenses.
     assert 1e-4 < np.abs(with_it - without).sum() < 1e-2
     moved = view._replace(centres_mm=view.centres_mm + np.array([0.004, 0.0]))
     place = (0.3, 0.1, 3.0)
-    before, after = images(view, place)[:, 0], images(moved, place)[:, 0]
+    before, after = twin_image(view, place)[:, 0], twin_image(moved, place)[:, 0]
     columns = np.arange(before.size) % view.camera.columns
     shift_px = (after @ columns) / after.sum() - (before @ columns) / before.sum()
     # The light's centre stays (the same rays), moved by the little that the micro-images shift beneath it.
@@ -177,32 +162,17 @@ def any_view(table2: Camera, water: Media, request: pytest.FixtureRequest) -> Vi
 @pytest.mark.thorough
 @pytest.mark.parametrize("place", ALL_PLACES)
 def test_rows_are_the_pixels_one_by_one(any_view: View, place: tuple[float, float, float]) -> None:
-    capacity = entry_capacity(any_view, -5.0, 5.0)
-    pixels, values = np.empty(capacity, np.int32), np.empty((capacity, 4))
-    count = respond_once(any_view, *place, pixels, values)
-    responses = room_for(1, capacity, 0)
-    respond_all(any_view, np.array([[*place, 1.0]]), responses)
-    named, rows = lit_by(responses, 0)
-    found = rows.T
-    images = np.zeros((2, any_view.camera.rows * any_view.camera.columns, 4))
-    np.add.at(images[0], named, found[: named.size])
-    np.add.at(images[1], pixels[:count], values[:count])
-    largest = np.abs(images[1]).max(axis=0)
+    slowly, quickly, (named, rows) = twin_image(any_view, place), rows_image(any_view, place), rows_of(any_view, place)
     # Rows are in single precision. Lenses of a turned array share profiles: those that are not in line at second order,
     # all of a thousandth of the light, and none of where a ball's edge begins to be seen.
     shared = any_view.cell_table.size == 0 and bool(np.ptp(any_view.centres_mm[:, 0, 0]) > 0.0)
     within = np.array([3e-4, 0.02, 0.02, 0.02]) if shared else np.full(4, 1e-4)
-    assert np.all(np.abs(images[0] - images[1]).sum(axis=0) < within * np.abs(images[1]).sum(axis=0))
-    lit = images[1][:, 0] > 0.0
-    columns = np.column_stack([images[1][lit, 1:], images[1][lit, 0]])
-    bias = np.linalg.lstsq(columns, (images[0] - images[1])[lit, 0], rcond=None)[0]
+    assert np.all(np.abs(quickly - slowly).sum(axis=0) < within * np.abs(slowly).sum(axis=0))
     # A fit would move by this: a hundredth of what it does where all is known but light's own noise.
-    assert np.abs(bias[:2]).max() < 1e-5
-    assert abs(bias[2]) < 2e-4
+    assert np.all(fit_moved(slowly, quickly[:, 0]) < (1e-5, 1e-5, 2e-4))
     # In chi-squared light is squared: each pixel has all of it in one entry.
     # What rounding leaves beside the ball is none.
-    least = 1e-6 * largest[0]
-    lit = found[: named.size, 0] > least
+    lit = rows[:, 0] > 1e-6 * slowly[:, 0].max()
     assert np.unique(named[lit]).size == np.count_nonzero(lit)
     # It is the first that names the pixel, by which pixels that two particles light are found.
     assert np.isin(np.flatnonzero(lit), np.unique(named, return_index=True)[1]).all()

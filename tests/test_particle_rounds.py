@@ -1,10 +1,11 @@
 """The whole search on a small image: particles are found where they were put, and their errors are as stated."""
 
-from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import ArrayLike
 from scipy.spatial import KDTree
 
 from lfpiv_cli.arrays import Floats
@@ -16,21 +17,30 @@ from lfpiv_cli.optics.tracing import ObjectSpace
 from lfpiv_cli.optics.waves import Waves
 from lfpiv_cli.particles.joining import boxes_of, explain_rest, find_peaks
 from lfpiv_cli.particles.rounds import ROUNDS, find_particles, first_pass, first_typical_light
-from lfpiv_cli.particles.search import noise_with, task_of
-from lfpiv_cli.particles.view import raw_view
+from lfpiv_cli.particles.search import noise_with
 from lfpiv_cli.reconstruction.solvers import normalisers
 from lfpiv_cli.synthetic.render import Balls, render_points
 from lfpiv_cli.validation.volume import particle_figures
 from lfpiv_cli.verbs.tracers import MUCH_LEFT_ALIKE
-from lfpiv_cli.weights.build import default_padding, factorise, factorise_bricks
 from lfpiv_cli.weights.model import Weights
-from tests.particle_images import light_on, task_with
+from tests.commands import WATER
+from tests.particle_images import seen_by, task_for, task_with
 
 
-def weights_of(camera: Camera, media: Media, grid: Grid) -> Weights:
-    padding = default_padding(camera, media, grid)
-    factorised = factorise if camera.lattice.layout == "square" else factorise_bricks
-    return Weights(grid, padding, factorised(camera, media, grid.padded(padding)), camera.column_axis)
+def grid_of(shape_xyz: tuple[int, int, int], z_mm: float, spacing_mm: tuple[float, float, float] = (0.1,) * 3) -> Grid:
+    """Return the grid of a volume about a depth, of voxels of 0.1 mm where nothing else is said."""
+    return Grid.centred(shape_xyz, spacing_mm, (0.0, 0.0, z_mm))
+
+
+def corners_mm(grid: Grid) -> Floats:
+    """Return the lowest and the highest corner of a volume (2, 3)."""
+    return np.array([grid.bounds_mm(axis) for axis in range(3)]).T
+
+
+def by_rays(camera: Camera, true: Floats, light: ArrayLike, rng: np.random.Generator, **how: Any) -> Floats:
+    """Return the image that rays, or waves, make of tracers in water."""
+    balls = Balls(true, light, 0.05)
+    return render_points(camera, ObjectSpace(WATER, None, "paraxial"), balls, rng, **({"rays": 100_000} | how))
 
 
 @pytest.mark.thorough
@@ -41,16 +51,12 @@ def test_particles_are_found_where_they_are(
     lattice = Lattice.regular(0.1, layout)
     camera = replace(table2, columns=420, rows=360, column_axis=column_axis, lattice=lattice)
     size = (18, 15, 16) if column_axis == "x" else (15, 18, 16)
-    grid = Grid.centred(size, (0.1, 0.1, 0.1), (0.0, 0.0, 1.9))
-    low, high = (np.array([grid.bounds_mm(axis)[side] for axis in range(3)]) for side in (0, 1))
-    weights, over_sigma = weights_of(camera, water, grid), []
+    grid, over_sigma = grid_of(size, 1.9), []
     for _ in range(2):
-        true, light = rng.uniform(low, high, (30, 3)), rng.uniform(3e5, 6e5, 30)
-        balls = Balls(true, light, 0.05)
-        expected = render_points(camera, ObjectSpace(water, None, "paraxial"), balls, rng, rays=100_000)
+        true, light = rng.uniform(*corners_mm(grid), (30, 3)), rng.uniform(3e5, 6e5, 30)
+        expected = by_rays(camera, true, light, rng)
         image = rng.poisson(expected).astype(np.float32) + rng.normal(0.0, 6.0, expected.shape).astype(np.float32)
-        view, sums = raw_view(camera, water, 0.025), normalisers(weights.padded)
-        found = find_particles(task_of(image, view, weights, camera, sums))
+        found = find_particles(task_for(image, camera, water, grid))
         scale = np.array([0.05, 0.05, 0.2])
         distance, nearest = KDTree(found.position_mm / scale).query(true / scale)
         matched = distance < 1.0
@@ -86,16 +92,12 @@ def test_a_larger_world_shows_the_same(table2: Camera, water: Media, rng: np.ran
     camera = replace(table2, columns=200, rows=180)
     # Some overlap, some lie near the focal plane: candidates, splitting, other depths and merging all take part.
     true = rng.uniform((-0.4, -0.35, -0.6, 3e5), (0.4, 0.35, 1.3, 6e5), (12, 4))
-    image = light_on(raw_view(camera, water, 0.025), true, (-1.0, 2.0))
-    image = (image + rng.normal(0.0, 6.0, image.size)).reshape(camera.rows, camera.columns).astype(np.float32)
-    found = []
+    image, found = seen_by(camera, water, true, (-1.0, 2.0)), []
+    image += rng.normal(0.0, 6.0, image.size)
     # Powers of two leave every digit as it is: a length that does not scale is all that can make a difference.
     for factor in (1.0, 4.0, 0.25):
-        larger = scaled(camera, factor)
-        spacing = factor * 0.1
-        weights = weights_of(larger, water, Grid.centred((8, 7, 19), (spacing,) * 3, (0.0, 0.0, factor * 0.35)))
-        view = raw_view(larger, water, factor * 0.025)
-        state = first_pass(task_of(image, view, weights, larger, normalisers(weights.padded)), ROUNDS[2:4])
+        grid = grid_of((8, 7, 19), factor * 0.35, (factor * 0.1,) * 3)
+        state = first_pass(task_for(image, scaled(camera, factor), water, grid, factor * 0.025), ROUNDS[2:4])
         found.append(state.particles / (factor, factor, factor, 1.0))
     assert len(found[0]) > 8
     for others in found[1:]:
@@ -107,12 +109,9 @@ def test_a_larger_world_shows_the_same(table2: Camera, water: Media, rng: np.ran
 def test_a_single_tracer_is_found_in_a_volume_partly_out_of_view(table2: Camera, water: Media, seed: int) -> None:
     """Where a voxel is hardly seen, noise is explained by more light than any tracer has."""
     rng = np.random.default_rng(seed)
-    camera = replace(table2, columns=160, rows=160)
-    weights = weights_of(camera, water, Grid.centred((24, 24, 7), (0.1, 0.1, 0.1), (0.0, 0.0, 1.9)))
-    true, view = np.array([[0.05, -0.1, 1.8, 5e5]]), raw_view(camera, water, 0.025)
-    image = light_on(view, true, (1.0, 3.0))
-    image = np.rint(with_noise(image, rng)).reshape(camera.rows, camera.columns).astype(np.float32)
-    state = first_pass(task_of(image, view, weights, camera, normalisers(weights.padded)), ROUNDS[:1])
+    camera, true = replace(table2, columns=160, rows=160), np.array([[0.05, -0.1, 1.8, 5e5]])
+    image = np.rint(with_noise(seen_by(camera, water, true, (1.0, 3.0)), rng))
+    state = first_pass(task_for(image, camera, water, grid_of((24, 24, 7), 1.9)), ROUNDS[:1])
     np.testing.assert_allclose(state.particles, true, rtol=0.02, atol=2e-3)
 
 
@@ -132,24 +131,17 @@ def with_noise(light: Floats, rng: np.random.Generator) -> Floats:
     ],
 )
 def test_any_brightness_will_do(
-    table2: Camera,
-    water: Media,
-    rng: np.random.Generator,
-    counts: float,
-    recorded: Callable[[Floats, np.random.Generator], Floats],
+    table2: Camera, water: Media, rng: np.random.Generator, counts: float, recorded: str
 ) -> None:
-    camera = replace(table2, columns=240, rows=240)
-    weights = weights_of(camera, water, Grid.centred((12, 12, 12), (0.1, 0.1, 0.1), (0.0, 0.0, 1.9)))
-    view, axis = raw_view(camera, water, 0.025), np.array([-0.42, 0.0, 0.42])
+    camera, axis = replace(table2, columns=240, rows=240), np.array([-0.42, 0.0, 0.42])
     true = np.stack(np.meshgrid(axis, axis, [1.9], [counts], indexing="ij"), axis=-1).reshape(-1, 4)
     true[:, :3] += rng.uniform((-0.05, -0.05, -0.3), (0.05, 0.05, 0.3), (9, 3))
-    image = light_on(view, true, (1.0, 3.0))
+    image = seen_by(camera, water, true, (1.0, 3.0))
     if recorded != "without noise":
         image = with_noise(image, rng)
     if recorded == "thresholded":
         image[image < 25.0] = 0.0
-    image = np.rint(image).reshape(camera.rows, camera.columns).astype(np.float32)
-    found = find_particles(task_of(image, view, weights, camera, normalisers(weights.padded)), ROUNDS[::5])
+    found = find_particles(task_for(np.rint(image), camera, water, grid_of((12, 12, 12), 1.9)), ROUNDS[::5])
     if counts == 0.0:
         assert not len(found.position_mm)
         return
@@ -161,21 +153,14 @@ def test_any_brightness_will_do(
 
 @pytest.mark.thorough
 def test_pixels_that_are_left_out_do_not_matter(table2: Camera, water: Media, rng: np.random.Generator) -> None:
-    camera = replace(table2, columns=360, rows=300)
-    grid = Grid.centred((14, 11, 10), (0.1, 0.1, 0.1), (0.0, 0.0, 1.9))
-    true = rng.uniform(*(np.array([grid.bounds_mm(axis)[side] for axis in range(3)]) for side in (0, 1)), (12, 3))
-    space = ObjectSpace(water, None, "paraxial")
-    image = render_points(camera, space, Balls(true, np.full(12, 4e5), 0.05), rng, rays=50_000).astype(np.float32)
-    image += rng.normal(0.0, 6.0, image.shape).astype(np.float32)
+    camera, grid = replace(table2, columns=360, rows=300), grid_of((14, 11, 10), 1.9)
+    true = rng.uniform(*corners_mm(grid), (12, 3))
+    image = by_rays(camera, true, 4e5, rng, rays=50_000)
+    image += rng.normal(0.0, 6.0, image.shape)
     left_out = np.zeros(image.shape, np.bool_)
     left_out[100:140, 150:200] = True
-    weights = weights_of(camera, water, grid)
-    sums = normalisers(weights.padded, left_out)
-    found = []
-    for reflection in (0.0, 5e4):
-        spoilt = np.where(left_out, np.float32(reflection), image)
-        view = raw_view(camera, water, 0.025)
-        found.append(find_particles(task_of(spoilt, view, weights, camera, sums, left_out)))
+    spoilt = (np.where(left_out, reflection, image) for reflection in (0.0, 5e4))
+    found = [find_particles(task_for(each, camera, water, grid, excluded=left_out)) for each in spoilt]
     np.testing.assert_array_equal(found[1].position_mm, found[0].position_mm)
     np.testing.assert_array_equal(found[1].covariance_mm2, found[0].covariance_mm2)
     distance, _ = KDTree(found[0].position_mm / (0.05, 0.05, 0.2)).query(true / (0.05, 0.05, 0.2))
@@ -185,27 +170,23 @@ def test_pixels_that_are_left_out_do_not_matter(table2: Camera, water: Media, rn
 
 def test_photons_count_as_the_camera_has_them(table2: Camera, water: Media, rng: np.random.Generator) -> None:
     camera = replace(table2, columns=120, rows=120)
-    weights = weights_of(camera, water, Grid.centred((4, 4, 3), (0.1, 0.1, 0.1), (0.0, 0.0, 1.9)))
-    image = rng.normal(0.0, 6.0, (120, 120)).astype(np.float32)
-    given = image, raw_view(camera, water, 0.025), weights, camera, normalisers(weights.padded)
-    assert noise_with(task_of(*given, photons_per_count=0.25), 5e5).gain_counts == 4.0
+    image = rng.normal(0.0, 6.0, (120, 120))
     # 2.5e5 photons a particle where they are not known.
-    assert noise_with(task_of(*given), 5e5).gain_counts == 2.0
+    for known, gain in (({"photons_per_count": 0.25}, 4.0), ({}, 2.0)):
+        assert noise_with(task_for(image, camera, water, grid_of((4, 4, 3), 1.9), **known), 5e5).gain_counts == gain
 
 
 @pytest.mark.thorough
 def test_an_empty_image_has_no_particles(table2: Camera, water: Media) -> None:
-    camera = replace(table2, columns=200, rows=200)
-    weights = weights_of(camera, water, Grid.centred((6, 6, 4), (0.1, 0.1, 0.1), (0.0, 0.0, 2.0)))
-    image = np.zeros((200, 200), np.float32)
-    found = find_particles(task_of(image, raw_view(camera, water, 0.025), weights, camera, normalisers(weights.padded)))
+    camera, image = replace(table2, columns=200, rows=200), np.zeros((200, 200))
+    found = find_particles(task_for(image, camera, water, grid_of((6, 6, 4), 2.0)))
     assert found.position_mm.shape == (0, 3)
     np.testing.assert_array_equal(found.residual, image)
 
 
 def test_what_is_explained_gives_no_candidate(table2: Camera, water: Media) -> None:
     camera = replace(table2, columns=300, rows=300)
-    weights = weights_of(camera, water, Grid.centred((10, 10, 5), (0.1, 0.1, 0.2), (0.0, 0.0, 2.0)))
+    weights = Weights.factorised(camera, water, grid_of((10, 10, 5), 2.0, (0.1, 0.1, 0.2)))
     volume = np.zeros(weights.shape, np.float32)
     volume[2, 2, 2] = volume[2, 7, 7] = 1e5
     one = np.zeros_like(volume)
@@ -262,16 +243,12 @@ def test_tracers_beyond_the_volume_are_found_there(table2: Camera, water: Media)
     # Two thirds lie up to 1 mm outside. Held within 0.3 mm of it, 22 ended there, and depths of those inside were seven
     # times as far off.
     rng = np.random.default_rng(3)
-    camera = replace(table2, columns=320, rows=280)
-    grid = Grid.centred((18, 15, 9), (0.1, 0.1, 0.1), (0.0, 0.0, 1.9))
-    weights, view = weights_of(camera, water, grid), raw_view(camera, water, 0.025)
+    camera, grid = replace(table2, columns=320, rows=280), grid_of((18, 15, 9), 1.9)
     true = rng.uniform((-0.8, -0.7, 0.5, 3e5), (0.8, 0.7, 3.3, 6e5), (60, 4))
-    image = light_on(view, true, (0.0, 4.0))
-    image = np.rint(with_noise(image, rng)).reshape(camera.rows, camera.columns).astype(np.float32)
-    found = find_particles(task_of(image, view, weights, camera, normalisers(weights.padded)))
+    image = np.rint(with_noise(seen_by(camera, water, true, (0.0, 4.0)), rng))
+    found = find_particles(task_for(image, camera, water, grid))
     sigma = np.sqrt(np.diagonal(found.covariance_mm2, axis1=1, axis2=2))
-    low, high = (np.array([grid.bounds_mm(axis)[side] for axis in range(3)]) for side in (0, 1))
-    figures = particle_figures(found.position_mm, camera.to_image_axes(true[:, :3]), low, high, 0.1, sigma)
+    figures = particle_figures(found.position_mm, camera.to_image_axes(true[:, :3]), *corners_mm(grid), 0.1, sigma)
     assert found.beyond.sum() <= 1
     assert min(figures["recall"], figures["precision"]) > 0.95
     assert figures["rms_z_voxel"] < 0.05
@@ -281,17 +258,10 @@ def test_tracers_beyond_the_volume_are_found_there(table2: Camera, water: Media)
 @pytest.mark.parametrize("waves", [None, Waves(532e-6)])
 def test_what_another_physics_leaves_is_alike(table2: Camera, water: Media, waves: Waves | None) -> None:
     # By waves 0.065 to 0.11 of the light near the focal plane, 0.6 of its depths covered; by rays up to 0.05.
-    rng = np.random.default_rng(0)
-    camera = replace(table2, columns=240, rows=220)
-    weights = weights_of(camera, water, Grid.centred((10, 9, 16), (0.1, 0.1, 0.1), (0.0, 0.0, 0.0)))
-    view, sums, space = (
-        raw_view(camera, water, 0.025),
-        normalisers(weights.padded),
-        ObjectSpace(water, None, "paraxial"),
-    )
+    rng, camera = np.random.default_rng(0), replace(table2, columns=240, rows=220)
     true, light = rng.uniform((-0.45, -0.4, -0.75), (0.45, 0.4, 0.75), (10, 3)), rng.uniform(3e5, 6e5, 10)
-    image = with_noise(render_points(camera, space, Balls(true, light, 0.05), rng, waves=waves, rays=100_000), rng)
-    found = find_particles(task_of(np.rint(image).astype(np.float32), view, weights, camera, sums))
+    image = with_noise(by_rays(camera, true, light, rng, waves=waves), rng)
+    found = find_particles(task_for(np.rint(image), camera, water, grid_of((10, 9, 16), 0.0)))
     left = np.linalg.norm(found.residual) / np.linalg.norm(image)
     assert (left * np.sqrt(found.alike) > MUCH_LEFT_ALIKE) == (waves is not None)
 
@@ -308,15 +278,13 @@ def test_what_another_physics_leaves_is_alike(table2: Camera, water: Media, wave
 def test_errors_of_single_tracers_near_the_focal_plane_are_covered(
     table2: Camera, water: Media, waves: Waves | None, light: float, least: float
 ) -> None:
-    camera = replace(table2, columns=150, rows=150)
-    weights = weights_of(camera, water, Grid.centred((5, 5, 50), (0.1, 0.1, 0.2), (0.0, 0.0, 0.0)))
-    view, sums = raw_view(camera, water, 0.025), normalisers(weights.padded)
-    space, over_sigma = ObjectSpace(water, None, "paraxial"), []
+    camera, over_sigma = replace(table2, columns=150, rows=150), []
+    grid = grid_of((5, 5, 50), 0.0, (0.1, 0.1, 0.2))
     for seed in range(100, 112):
         rng = np.random.default_rng(seed)
         true = rng.uniform((-0.1, -0.1, -0.8), (0.1, 0.1, 0.8), (1, 3))
-        image = with_noise(render_points(camera, space, Balls(true, light, 0.05), rng, waves=waves, rays=100_000), rng)
-        found = find_particles(task_of(np.rint(image).astype(np.float32), view, weights, camera, sums))
+        image = with_noise(by_rays(camera, true, light, rng, waves=waves), rng)
+        found = find_particles(task_for(np.rint(image), camera, water, grid))
         assert len(found.position_mm) >= 1
         over_sigma.append((found.position_mm[0] - true[0]) / np.sqrt(np.diagonal(found.covariance_mm2[0])))
     # Of twelve within two binomial standard errors of what many show: 0.97, and 0.77 by waves.
