@@ -48,27 +48,6 @@ def test_interpolation_sums_b_splines(spread: tuple[float, float], fewer: bool, 
         assert sums[1, k] == pytest.approx(np.sum(share * b[at + k + away]), abs=1e-5)
 
 
-@pytest.mark.parametrize("radius", [1, 2, 4])
-def test_products_are_summed_over_windows_for_every_shift(radius: int, rng: np.random.Generator) -> None:
-    a, b = rng.standard_normal((2, 5, 6, 80), np.float32)
-    layout = layout_windows((80, 6, 5), (70, 4, 3), (0.5, 0.5, 0.5))
-    before, after = margins(layout, a.shape, radius)
-    padded_a, padded_b = (np.pad(one, list(zip(before, after, strict=True))) for one in (a, b))
-    sums = map_sums(padded_a, padded_b, layout, before, radius)
-    places = rng.integers(0, 2 * radius + 1, (20, 3))
-    first = np.add(before, layout.first[::-1])
-    here = tuple(slice(low, low + size) for low, size in zip(first, layout.size[::-1], strict=True))
-    assert sums.blocks.per_window[:2] == (1, 1)
-    for place in places:
-        shift = place - radius
-        there, back = (
-            tuple(slice(s.start + k, s.stop + k) for s, k in zip(here, sign * shift, strict=True)) for sign in (1, -1)
-        )
-        wide_a, wide_b = padded_a.astype(np.float64), padded_b.astype(np.float64)
-        expected = np.sum(wide_a[here] * wide_b[there] + wide_a[back] * wide_b[here])
-        assert sums.products[0, 0, 0][tuple(place)] == pytest.approx(expected, abs=2e-4)
-
-
 def test_moments_are_those_of_gradient_mean_and_difference(rng: np.random.Generator) -> None:
     a, b = rng.standard_normal((2, 6, 7, 12), np.float32)
     valid = (rng.random(a.shape) < 0.95).astype(np.uint8)
@@ -92,7 +71,9 @@ HALF = (0.5, 0.5, 0.5)
 TABLE2 = ROOT / "configs" / "table2.yaml"
 # An odd size, shared and unshared cells, windows that overhang and leave gaps.
 LAYOUTS = [((8, 7, 6), HALF), ((8, 8, 8), HALF), ((9, 6, 4), (0.75, 0.0, 0.5))]
-MORE_LAYOUTS = [*LAYOUTS, ((8, 7, 6), (0.75, 0.5, 0.0)), ((16, 12, 8), HALF)]
+MORE_LAYOUTS = [(*each, 2) for each in (*LAYOUTS, ((8, 7, 6), (0.75, 0.5, 0.0)), ((16, 12, 8), HALF))]
+# Fewer and more shifts; windows longer than a vector of the processor's.
+MORE_LAYOUTS += [((70, 4, 3), HALF, 1), ((8, 7, 6), HALF, 4)]
 
 
 def layout_of(
@@ -128,18 +109,22 @@ def test_the_registry_has_the_names_that_config_and_option_choose() -> None:
 
 
 @pytest.mark.parametrize("weighting", names_in(Weighting))
-@pytest.mark.parametrize(("size", "overlap"), MORE_LAYOUTS)
+@pytest.mark.parametrize(("size", "overlap", "radius"), MORE_LAYOUTS)
 def test_maps_are_the_symmetric_normalised_correlation(
-    size: tuple[int, int, int], overlap: tuple[float, float, float], weighting: Weighting, rng: np.random.Generator
+    size: tuple[int, int, int],
+    overlap: tuple[float, float, float],
+    radius: int,
+    weighting: Weighting,
+    rng: np.random.Generator,
 ) -> None:
-    layout, radius = layout_of(size, overlap, weighting), 2
-    a, b = rng.random((2, 18, 20, 22)).astype(np.float32)
+    layout = replace(layout_windows((max(22, size[0]), 20, 18), size, overlap), weighting=weighting)
+    a, b = rng.random((2, 18, 20, max(22, size[0]))).astype(np.float32)
     before, after = margins(layout, a.shape, radius)
     padded_a, padded_b = (np.pad(volume, list(zip(before, after, strict=True))) for volume in (a, b))
     maps = map_sums(padded_a, padded_b, layout, before, radius).correlation()
     weights = weights_in(layout)
     for index in [(0, 0, 0), (1, 1, 0), tuple(n - 1 for n in layout.count[::-1])]:
-        for shift in np.ndindex(5, 5, 5):
+        for shift in np.ndindex((2 * radius + 1,) * 3):
             there, back = (
                 tuple(m + sign * (s - radius) for m, s in zip(before, shift, strict=True)) for sign in (1, -1)
             )
