@@ -20,7 +20,7 @@ from lfpiv_cli.files.weights_file import open_weights
 from lfpiv_cli.flow.field import MASKED
 from lfpiv_cli.self_calibration import refinement
 from lfpiv_cli.weights.strips import StripOperator
-from tests.commands import CONFIG, ROOT, SAMPLE, run
+from tests.commands import AT_FOCUS, CONFIG, ROOT, SAMPLE, changed, run, sample_rig, told
 
 CONFIGS = ROOT / "configs"
 # What stands in the files, and what makes of them a section of the pipe's middle on a part of the sensor.
@@ -104,31 +104,22 @@ ASLANT = "axis: [1, -0.0043634, 0.0043634]"
 @pytest.mark.slow
 def test_a_pipe_that_lies_elsewhere_is_found(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Images of one pipe, the rig file of another: its axis is found, and with it the flow is right."""
-    told = (CONFIGS / "pipe.yaml").read_text()
-    for old, new in {
-        "rows: 1768": "rows: 500",
-        "shape_xyz: [100, 100, 100]": "shape_xyz: [22, 100, 100]",
-        "particles: 5000": "particles: 1100",
-        "seed: 7": "seed: 23",
-    }.items():
-        assert told.count(old) == 1, old
-        told = told.replace(old, new)
-    true, faces = re.subn(f"axis: x, (radius_mm: .*), {re.escape(TOLD)}", rf"{ASLANT}, \1, {BESIDE}", told)
+    fewer = ("shape_xyz: [100, 100, 100]", "shape_xyz: [22, 100, 100]"), ("particles: 5000", "particles: 1100")
+    text = changed("pipe", ("rows: 1768", "rows: 500"), *fewer, ("seed: 7", "seed: 23"))
+    true, faces = re.subn(f"axis: x, (radius_mm: .*), {re.escape(TOLD)}", rf"{ASLANT}, \1, {BESIDE}", text)
     true, sections = re.subn(r"axis: x([,}])", rf"{ASLANT}, {BESIDE}\1", true)
     assert (faces, sections) == (2, 3)  # of these the pipe, the flow and what it is judged by
     # Whole: the true pipe reaches beyond the volume that is told.
     true = true.replace("shape_xyz: [22, 100, 100]", "shape_xyz: [22, 106, 106]")
-    for name, text in (("told", told), ("true", true)):
-        (tmp_path / f"{name}.yaml").write_text(text)
+    for name, each in (("told", text), ("true", true)):
+        (tmp_path / f"{name}.yaml").write_text(each)
     run("simulate", "particles", tmp_path / "true.yaml", "-o", tmp_path / "sim")
     run("simulate", "white", tmp_path / "true.yaml", "-o", tmp_path)
     lattice, refined, images = tmp_path / "lattice.h5", tmp_path / "refined.h5", tmp_path / "sim"
     dark = ("--dark", tmp_path / "dark.tif")
     run("calibrate-snapshot", tmp_path / "told.yaml", "--white", tmp_path / "white.tif", *dark, "-o", lattice)
-    capsys.readouterr()
-    words = ("--calibration", lattice, *dark, "-o", refined, "--picture", tmp_path / "walls.png", "--json")
-    run("refine-calibration", tmp_path / "told.yaml", images / "pair_a.tif", *words)
-    figures = json.loads(capsys.readouterr().out)
+    words = ("--calibration", lattice, *dark, "-o", refined, "--picture", tmp_path / "walls.png")
+    figures = told(capsys, "refine-calibration", tmp_path / "told.yaml", images / "pair_a.tif", *words)
     # Measured: within 2 um and 0.01 degrees by the images; by the wall of so little pipe within its error, some 40 um.
     np.testing.assert_allclose(figures["axis_shift_mm"], (-0.1, 0.15), atol=0.01)
     np.testing.assert_allclose(figures["axis_tilt_deg"], TILT_DEG, atol=0.06)
@@ -173,10 +164,8 @@ def wrong(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_wrong_mid_plane_is_found_and_mended(wrong: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     image, dark = SAMPLE / "pair_a.tif", ("--dark", SAMPLE / "dark.tif")
     output, picture = tmp_path / "refined.h5", tmp_path / "walls.png"
-    capsys.readouterr()
-    targets = ("-o", output, "--picture", picture, "--json")
-    run("refine-calibration", CONFIG, image, "--calibration", wrong, *dark, *targets)
-    summary = json.loads(capsys.readouterr().out)
+    targets = ("-o", output, "--picture", picture)
+    summary = told(capsys, "refine-calibration", CONFIG, image, "--calibration", wrong, *dark, *targets)
     truth = json.loads((SAMPLE / "particles.json").read_text())["reference_z_mm"]
     assert abs(summary["mid_plane_z_mm"] - truth) < 3 * summary["mid_plane_z_mm_sigma"]
     assert summary["mid_plane_z_mm_sigma"] < 0.03
@@ -206,9 +195,7 @@ def test_half_a_millimetre_on_the_pair(data_folder: Path, tmp_path: Path, capsys
     assert right.mid_plane_z_mm is not None
     moved = replace(right.rectification, fit=right.fit.shifted(np.array([0.2, -0.1])))
     write_calibration(off, replace(right, rectification=moved, mid_plane_z_mm=right.mid_plane_z_mm + 0.5), {}, False)
-    capsys.readouterr()
-    run("refine-calibration", config, data / "pair_a.tif", "--calibration", off, *dark, "--json")
-    summary = json.loads(capsys.readouterr().out)
+    summary = told(capsys, "refine-calibration", config, data / "pair_a.tif", "--calibration", off, *dark)
     truth = json.loads((data / "truth.json").read_text())
     # Measured: 0.002 mm and 0.0004 px are left.
     left = summary["mid_plane_z_mm"] - truth["mid_plane_z_mm"]
@@ -222,9 +209,7 @@ def test_half_a_millimetre_on_the_pair(data_folder: Path, tmp_path: Path, capsys
 
 @pytest.mark.thorough
 def test_a_config_without_a_channel_is_refused(wrong: Path, tmp_path: Path) -> None:
-    config = tmp_path / "rig.yaml"
-    lines = [line for line in CONFIG.read_text().splitlines() if not line.startswith("channel")]
-    config.write_text("\n".join(lines).replace("reference: mid_plane", "reference: focal_point"))
+    config = sample_rig(tmp_path, AT_FOCUS, ("\nchannel:", "\n# channel:"))
     with pytest.raises(ConfigError, match="channel: is missing"):
         run("refine-calibration", config, SAMPLE / "pair_a.tif", "--calibration", wrong)
 
@@ -265,7 +250,7 @@ def tube(radius_mm: float) -> tuple[str, str]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("shown", "told", "words"),
+    ("shown", "said", "words"),
     [
         (PLANES, tube(2.0), r"of the image's light is not that of the \d+ tracers .* at most 45%"),
         (tube(2.0), tube(2.6), r"98% of the tracers lie within [12]\.\d+ mm .* radius_mm is 2\.6"),
@@ -273,7 +258,7 @@ def tube(radius_mm: float) -> tuple[str, str]:
     ],
 )
 def test_images_that_are_not_of_the_pipe_are_refused_before_the_search(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, shown: tuple[str, str], told: tuple[str, str], words: str
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, shown: tuple[str, str], said: tuple[str, str], words: str
 ) -> None:
     """What fits is searched on; steps of the scene are not tried on what does not."""
 
@@ -281,7 +266,7 @@ def test_images_that_are_not_of_the_pipe_are_refused_before_the_search(
         raise InputError("searched on")
 
     monkeypatch.setattr(refinement, "fit_nuisances", on)
-    for name, (outer, inner) in (("shown", shown), ("told", told)):
+    for name, (outer, inner) in (("shown", shown), ("told", said)):
         text = RIG.format(outer=outer, inner=inner, centre="0, 0, 0", seed=31).replace("[14, 12, 30]", "[24, 20, 40]")
         pipe = f"pipe: {{{inner.split(', ')[2]}}}\n" if "cylinder" in inner else ""
         (tmp_path / f"{name}.yaml").write_text(text.replace("particles: 24", "particles: 250\n  rays: 8000") + pipe)
