@@ -38,8 +38,9 @@ def task_for(image: Floats, camera: Camera, media: Media, grid: Grid, radius_mm:
     factorised = factorise if camera.lattice.layout == "square" else factorise_bricks
     weights = Weights(grid, padding, factorised(camera, media, grid.padded(padding)), camera.column_axis)
     shaped = image.reshape(camera.rows, camera.columns).astype(np.float32)
+    view = raw_view(camera, media, radius_mm, light=known.pop("light", None))
     sums = normalisers(weights.padded, known.get("excluded"))
-    return task_of(shaped, raw_view(camera, media, radius_mm), weights, camera, sums, **known)
+    return task_of(shaped, view, weights, camera, sums, **known)
 
 
 def task_with(table2: Camera, water: Media, true: Floats, rng: np.random.Generator, noise: float = 6.0) -> Task:

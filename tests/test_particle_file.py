@@ -1,5 +1,6 @@
 """Particles and tracks on disk: what is written is read, VTK opens and plays it, what is broken is refused."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -9,9 +10,19 @@ import pytest
 from lfpiv_cli.errors import InputError, OutputError, OutputExistsError
 from lfpiv_cli.files import hdf5, particle_file
 from lfpiv_cli.files.export_vtk import write_playback
-from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, POSITION, Points, StoredTracks, read_points, write_points
+from lfpiv_cli.files.particle_file import (
+    PARTICLES_FORMAT,
+    POSITION,
+    TRACKS_FORMAT,
+    TRAJECTORIES_FORMAT,
+    Points,
+    StoredTracks,
+    read_points,
+    write_points,
+)
 from lfpiv_cli.grid import Reference
-from lfpiv_cli.verbs.track import KEPT_FRAMES, SeenFrames
+from tests.read_back import vtk_opened
+from tests.vector_fields import points_of
 
 REFERENCE = Reference("mid_plane", -0.4)
 
@@ -19,15 +30,9 @@ REFERENCE = Reference("mid_plane", -0.4)
 @pytest.fixture
 def path(tmp_path: Path, rng: np.random.Generator) -> Path:
     target = tmp_path / "particles.vtkhdf"
-    arrays = {
-        "intensity": rng.uniform(1.0, 2.0, 5),
-        "covariance_mm2": rng.uniform(1.0, 2.0, (5, 6)),
-        "chi2": np.ones(5),
-        "seen": np.ones(5),
-        "flag": np.zeros(5, np.uint8),
-    }
-    position = np.arange(15.0).reshape(5, 3)
-    write_points(target, PARTICLES_FORMAT, Points(position, arrays, REFERENCE, {}, {"a": 1}), overwrite=False)
+    points = points_of(PARTICLES_FORMAT, rng, 5, {"a": 1})
+    points = replace(points, position_mm=np.arange(15.0).reshape(5, 3), reference=REFERENCE)
+    write_points(target, PARTICLES_FORMAT, points, overwrite=False)
     return target
 
 
@@ -39,13 +44,9 @@ def test_what_is_written_is_read_and_vtk_opens_the_very_file(path: Path) -> None
     assert points.provenance == {"a": 1}
     matrix = np.array([[[1.0, 4.0, 6.0], [4.0, 2.0, 5.0], [6.0, 5.0, 3.0]]])
     assert particle_file.symmetric(matrix).tolist() == [[1.0, 2.0, 3.0, 4.0, 5.0, 6.0]]
-    vtk = pytest.importorskip("vtkmodules.vtkIOHDF")
+    data = vtk_opened(path).GetOutput()
     from vtkmodules.util.numpy_support import vtk_to_numpy
 
-    reader = vtk.vtkHDFReader()
-    reader.SetFileName(str(path))
-    reader.Update()
-    data = reader.GetOutput()
     assert data.GetPointData().GetScalars().GetName() == "intensity"
     assert data.GetPointData().GetVectors() is None
     assert data.GetNumberOfPoints() == data.GetNumberOfVerts() == 5
@@ -54,9 +55,7 @@ def test_what_is_written_is_read_and_vtk_opens_the_very_file(path: Path) -> None
     np.testing.assert_array_equal(intensity, read_points(path, PARTICLES_FORMAT).arrays["intensity"])
 
 
-def test_another_format_and_values_that_are_no_numbers_are_refused(path: Path) -> None:
-    with pytest.raises(InputError, match="lfpiv-tracks"):
-        read_points(path, particle_file.TRACKS_FORMAT)
+def test_values_that_are_no_numbers_are_refused(path: Path) -> None:
     with h5py.File(path, "a") as file:
         file["chi2"][2] = np.nan
     with pytest.raises(InputError, match="chi2"):
@@ -75,15 +74,12 @@ def tracks() -> Points:
 
 
 def test_vtk_plays_the_places_of_each_frame(tracks: Points, tmp_path: Path) -> None:
-    vtk = pytest.importorskip("vtkmodules.vtkIOHDF")
-    from vtkmodules.util.numpy_support import vtk_to_numpy
-
     write_playback(tmp_path / "playback.vtkhdf", tracks, 5, 0.002, overwrite=False)
     with pytest.raises(OutputExistsError):
         write_playback(tmp_path / "playback.vtkhdf", tracks, 4, 0.002, overwrite=False)
-    reader = vtk.vtkHDFReader()
-    reader.SetFileName(str(tmp_path / "playback.vtkhdf"))
-    reader.UpdateInformation()
+    reader = vtk_opened(tmp_path / "playback.vtkhdf")
+    from vtkmodules.util.numpy_support import vtk_to_numpy
+
     assert reader.GetNumberOfSteps() == 5
     for step in range(5):
         reader.SetStep(step)
@@ -95,9 +91,8 @@ def test_vtk_plays_the_places_of_each_frame(tracks: Points, tmp_path: Path) -> N
             np.testing.assert_array_equal(vtk_to_numpy(shown.GetPoints().GetData()), tracks.position_mm[here])
             assert shown.GetPointData().GetVectors().GetName() == "velocity"
             for name in ("track", "velocity"):
-                np.testing.assert_array_equal(
-                    vtk_to_numpy(shown.GetPointData().GetArray(name)), tracks.arrays[name][here]
-                )
+                stored = vtk_to_numpy(shown.GetPointData().GetArray(name))
+                np.testing.assert_array_equal(stored, tracks.arrays[name][here])
 
 
 FRAMES, TRACKS = 9, 40
@@ -135,7 +130,7 @@ def test_files_are_those_of_tracks_in_memory(
     monkeypatch.setattr(particle_file, "CHECKED_ROWS", 30)
     with put(tmp_path, many_tracks) as stored:
         for name, each in (("memory", many_tracks), ("disk", stored)):
-            write_points(tmp_path / f"{name}.vtkhdf", particle_file.TRAJECTORIES_FORMAT, each, overwrite=False)
+            write_points(tmp_path / f"{name}.vtkhdf", TRAJECTORIES_FORMAT, each, overwrite=False)
             write_playback(tmp_path / f"{name}_played.vtkhdf", each, FRAMES, 0.1, overwrite=False)
     for name in ("{}.vtkhdf", "{}_played.vtkhdf"):
         memory, disk = ((tmp_path / name.format(each)).read_bytes() for each in ("memory", "disk"))
@@ -155,26 +150,18 @@ def test_tracks_are_read_block_by_block(many_tracks: Points, tmp_path: Path, mon
     assert max(map(len, pieces)) < 20 + FRAMES
 
 
-def test_no_tracks_are_written_too(tmp_path: Path) -> None:
-    nothing = {name: np.zeros(0, np.int64) for name in ("track", "frame", "particle")}
-    nothing |= {name: np.zeros((0, 3)) for name in (POSITION, "velocity", "velocity_sigma")}
-    nothing |= {"link_probability": np.zeros(0)}
+def test_no_tracks_are_written_too(tmp_path: Path, rng: np.random.Generator) -> None:
+    empty = points_of(TRAJECTORIES_FORMAT, rng, 0)
+    nothing = {POSITION: empty.position_mm} | empty.arrays
     with StoredTracks(tmp_path, REFERENCE, {}, {}) as store:
         store.put(nothing)
         store.put(nothing)
-        write_points(tmp_path / "none.vtkhdf", particle_file.TRAJECTORIES_FORMAT, store, overwrite=False)
+        write_points(tmp_path / "none.vtkhdf", TRAJECTORIES_FORMAT, store, overwrite=False)
         write_playback(tmp_path / "played.vtkhdf", store, 2, 0.1, overwrite=False)
     with h5py.File(tmp_path / "none.vtkhdf") as file:
         assert file[POSITION].shape == (0, 3)
-    pair = {name: np.zeros((0, 3)) for name in ("velocity", "velocity_sigma", "displacement_mm")}
-    pair |= {name: np.zeros(0, np.int64) for name in ("particle_a", "particle_b")} | {"link_probability": np.zeros(0)}
-    write_points(
-        tmp_path / "t.vtkhdf",
-        particle_file.TRACKS_FORMAT,
-        Points(np.zeros((0, 3)), pair, REFERENCE, {}, {}),
-        overwrite=False,
-    )
-    assert read_points(tmp_path / "t.vtkhdf", particle_file.TRACKS_FORMAT).position_mm.shape == (0, 3)
+    write_points(tmp_path / "t.vtkhdf", TRACKS_FORMAT, points_of(TRACKS_FORMAT, rng, 0), overwrite=False)
+    assert read_points(tmp_path / "t.vtkhdf", TRACKS_FORMAT).position_mm.shape == (0, 3)
 
 
 def test_full_disks_and_lost_folders_are_told(
@@ -186,21 +173,3 @@ def test_full_disks_and_lost_folders_are_told(
     monkeypatch.setattr(particle_file.tempfile, "TemporaryFile", lambda **_: full)
     with pytest.raises(OutputError, match="No space left"):
         put(tmp_path, many_tracks)
-
-
-def test_the_last_few_frames_stay_in_memory() -> None:
-    read: list[int] = []
-
-    def frame(number: int) -> Points:
-        read.append(number)
-        arrays = {"covariance_mm2": np.zeros((number, 6)), "intensity": np.ones(number)}
-        return Points(np.zeros((number, 3)), arrays, REFERENCE, {}, {})
-
-    frames = SeenFrames(KEPT_FRAMES + 2, frame)
-    for number in range(len(frames)):
-        for before in range(max(number - KEPT_FRAMES + 1, 0), number + 1):
-            assert len(frames[before]) == before
-    assert read == list(range(len(frames)))
-    # The first one's count is known, and it is read again for more.
-    assert (frames.particles(0), len(read)) == (0, len(frames))
-    assert (len(frames[0]), read[-1]) == (0, 0)

@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numba import typeof, types
 from scipy.signal import lfilter
 
 from lfpiv_cli.arrays import Floats
@@ -38,13 +37,11 @@ def observed(view: View, residual: Floats, weight: Floats) -> Observation:
     return observation_of(view, residual, weight, DEPTHS)
 
 
-def stated(
-    view: View, particles: Floats, correlation: Correlation = WHITE, worse: float = 1.0, *shared: object
-) -> Floats:
+def stated(view: View, particles: Floats, alike: Correlation = WHITE, worse: float = 1.0, *shared: object) -> Floats:
     """Return covariances of particles in an image of their own light."""
     weight = 1.0 / (image_of(view, particles) + 36.0)
     blind = observed(view, np.zeros_like(weight), weight)
-    return joint_covariance(blind, particles, correlation, np.full(len(particles), worse), *shared)
+    return joint_covariance(blind, particles, alike, np.full(len(particles), worse), *shared)
 
 
 def slopes_of(view: View, particles: Floats) -> Floats:
@@ -107,11 +104,6 @@ def test_image_and_what_is_expected_count_by_their_errors(view: View, rng: np.ra
     np.testing.assert_allclose((fitted(prior) - both) / error, 0.0, atol=0.02)
 
 
-def test_the_type_of_an_observation_is_numbas_own(view: View) -> None:
-    observation = observed(view, np.zeros(12), np.ones(12))
-    assert typeof(observation) == types.NamedTuple([typeof(each) for each in observation], Observation)
-
-
 @pytest.mark.thorough
 @pytest.mark.parametrize("depth", [-0.1, 0.2, 2.0])
 def test_a_pixel_between_micro_images_counts_once(view: View, rng: np.random.Generator, depth: float) -> None:
@@ -160,11 +152,9 @@ def test_a_ghost_is_not_accepted_nor_what_hardly_meets_the_sensor(view: View, rn
     weight = np.full_like(residual, 1.0 / 36.0)
     *_, seen = judge(observed(view, residual, weight), candidate)
     assert 0.0 < seen[0] < 0.1
-    taken = [
-        accept(observed(view, residual.copy(), weight), candidate.copy(), Least(1e5, 0.5, least, 50.0)).tolist()
-        for least in (0.0, 0.1)
-    ]
-    assert taken == [[True], [False]]
+    for least, taken in ((0.0, True), (0.1, False)):
+        observation = observed(view, residual.copy(), weight)
+        assert accept(observation, candidate.copy(), Least(1e5, 0.5, least, 50.0)).tolist() == [taken]
 
 
 @pytest.mark.thorough
@@ -198,8 +188,7 @@ def test_neighbours_that_are_free_widen_the_errors_and_all_have_some(view: View)
         # Slopes of a turned array's lenses, which share profiles, are off by up to a hundredth.
         np.testing.assert_allclose(np.sqrt(np.diag(found[number])), np.sqrt(np.diag(whole[part, part])), rtol=5e-3)
     blind = observed(view, np.zeros_like(weight), weight)
-    alone = joint_covariance(blind, particles[[0]], WHITE, np.ones(1))
-    assert found[0, 2, 2] > 1.1 * alone[0, 2, 2]
+    assert found[0, 2, 2] > 1.1 * joint_covariance(blind, particles[[0]], WHITE, np.ones(1))[0, 2, 2]
     # Near the focal plane many pixels are lit through two lenses, and count once all the same.
     near = np.array([[0.2295, 0.0436, 0.1066, 5e5], [0.2168, 0.0374, 0.1087, 5e5]])
     assert np.all(np.diagonal(stated(view, near), axis1=1, axis2=2) > 0.0)
@@ -342,8 +331,7 @@ def test_noise_is_what_a_fit_leaves_and_rounding_does_not_tell_it(rng: np.random
     for counts in (dim, bright):
         expected, measured = (each.weights(counts, np.zeros(1), 0.0) for each in (true, single))
         assert measured == pytest.approx(expected, rel=0.5)
-    few = measured_noise(model[:100], residual[:100], usable[:100], Noise(6.0, 2.0))
-    assert few == Noise(6.0, 2.0)
+    assert measured_noise(model[:100], residual[:100], usable[:100], Noise(6.0, 2.0)) == Noise(6.0, 2.0)
     # Light that fills micro-images makes many pixels alike: rounding must not tell in which class they are.
     model = np.repeat(rng.uniform(50.0, 500.0, 60), 90)
     residual = rng.normal(size=model.size) * np.sqrt(36.0 + 2.0 * model)

@@ -1,4 +1,4 @@
-"""Searches: sweeps over what has changed end where those over all do; a tracer found twice is joined, two are not."""
+"""Searches: sweeps, tracers found twice, errors that tracers share, their number, the focus of microlenses."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -6,14 +6,39 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+import lfpiv_cli as lf
 from lfpiv_cli.arrays import Floats
+from lfpiv_cli.calibration.white import vignetting_surface
+from lfpiv_cli.files.config import carried_config
+from lfpiv_cli.files.weights_file import WeightsFile
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media
 from lfpiv_cli.particles import search
-from lfpiv_cli.particles.fitting import refine
+from lfpiv_cli.particles.fitting import add_all, refine
 from lfpiv_cli.particles.joining import with_twins_joined
-from lfpiv_cli.particles.least_squares import SMALLEST_GAIN
-from lfpiv_cli.particles.search import State, Task, blank, disturbance, merge, noise_with, observed, rebuilt
+from lfpiv_cli.particles.least_squares import SMALLEST_GAIN, observation_of
+from lfpiv_cli.particles.microlens_focus import FEWEST_PARTICLES, FocalLength, focal_length_of
+from lfpiv_cli.particles.search import (
+    DOUBTFUL_EXCESS,
+    MUCH_LEFT,
+    TAKEN_UP,
+    State,
+    Task,
+    blank,
+    disturbance,
+    grown,
+    light_left,
+    merge,
+    missing_light,
+    noise_with,
+    observed,
+    rebuilt,
+)
+from lfpiv_cli.particles.view import View, raw_view
+from lfpiv_cli.verbs.frames import Bench, bench_of, frame_notices
+from lfpiv_cli.verbs.particles import find, frame_of, points_of, task_for, tracers_per_lens
+from lfpiv_cli.verbs.tracers import TracerSize, light_notices
+from tests.commands import AT_FOCUS, sample_rig
 from tests.particle_images import found, light_on, task_with
 
 TYPICAL = 5e5
@@ -162,3 +187,245 @@ def test_particles_in_one_place_are_added_up_and_few_have_no_twins(task: Task, t
     np.testing.assert_allclose(merged.residual, rebuilt(task, merged, merged.particles).residual, atol=1e-6)
     assert len(joined(task, tracers[:1])) == 1
     assert len(joined(task, tracers[:0])) == 0
+
+
+@pytest.fixture
+def view(table2: Camera, water: Media) -> View:
+    return raw_view(replace(table2, columns=120, rows=110), water, 0.025)
+
+
+def test_light_that_is_left_is_counted_without_noise(rng: np.random.Generator) -> None:
+    image = rng.uniform(0.0, 500.0, 100_000)
+    noise, wrong = rng.normal(0.0, 6.0, image.size), 0.2 * image * rng.choice([-1.0, 1.0], image.size)
+    assert light_left(image, noise, 6.0) < 0.003
+    assert light_left(image, noise + wrong, 6.0) == pytest.approx(0.2, abs=0.002)
+    assert light_left(np.zeros(4), np.zeros(4), 6.0) == 0.0
+
+
+def test_errors_grow_where_light_is_left_and_most_in_depth(view: View) -> None:
+    particles = np.array([[0.0, 0.0, 0.1, 1e5], [0.0, 0.0, 3.0, 1e5]])
+    covariance = np.tile(np.diag([1.0, 1.0, 900.0, 1e6]), (2, 1, 1)) + 0.5
+    np.testing.assert_array_equal(grown(view, particles, covariance, 0.9 * MUCH_LEFT), covariance)
+    before = covariance
+    for left in (1.1, 1.3, 2.0):
+        found = grown(view, particles, covariance, left * MUCH_LEFT)
+        assert np.all(np.linalg.eigvalsh(found) > 0.0)
+        assert np.all(np.diagonal(found - before, axis1=1, axis2=2) > 0.0)
+        before = found
+    growth = np.sqrt(np.diagonal(found / covariance, axis1=1, axis2=2))
+    # Fitted by rays, tracers by waves in some 16 lenses were four times as far off in depth as stated, twice sideways.
+    assert growth[1, 2] == pytest.approx(4.0, abs=0.5)
+    assert growth[1, 0] == pytest.approx(2.2, abs=0.3)
+    assert np.all(growth[1] > growth[0])
+
+
+def test_errors_do_not_grow_for_what_is_noise(view: View) -> None:
+    particles, covariance = np.array([[0.0, 0.0, 3.0, 1e5]]), np.eye(4)[np.newaxis]
+    known = [grown(view, particles, covariance, 2.0 * MUCH_LEFT, alike)[0, 2, 2] for alike in (0.0, 0.1, 0.2, 1.0)]
+    assert known[0] == 1.0
+    assert 1.0 < known[1] < known[2] == known[3]
+
+
+def test_variances_grow_with_what_the_best_ones_do_not_leave(rng: np.random.Generator) -> None:
+    # By noise alone chi-squared of 330 pixels scatters by a thirteenth, and nothing is missing.
+    noise = rng.chisquare(330, 2000) / 330
+    light, known = rng.uniform(0.6, 1.4, noise.size), np.ones(noise.size, np.bool_)
+    assert np.mean(missing_light(noise, light, known, 330.0)) < 1.1
+    # Nor is it where noise goes with a particle's light: it is as much larger, and no more.
+    np.testing.assert_allclose(np.mean(missing_light(light * noise, light, known, 330.0) / light), 1.0 / 0.64, rtol=0.1)
+    # One by itself tells no other reference than 1.
+    assert missing_light(np.array([0.9]), np.ones(1), known[:1], 330.0) == pytest.approx(1.0)
+    # A root of chi-squared that is twice that of the best ones counts nearly whole.
+    twice = 1.0 + TAKEN_UP / (1.0 + DOUBTFUL_EXCESS)
+    assert missing_light(np.array([4.0]), np.ones(1), ~known[:1], 330.0) == pytest.approx(twice, rel=0.1)
+    # In crowds noise seems four times as large as it is, and 1 is no good particle's chi-squared.
+    crowd = np.concatenate([0.25 * noise[:200], rng.lognormal(1.0, 1.5, 800), [0.25, 1.0, 100.0]])
+    light, known = rng.uniform(0.6, 1.4, crowd.size), np.arange(crowd.size) < 1000
+    light[-3:] = 1.0
+    at_best, at_one, at_hundred = missing_light(crowd, light, known, 330.0)[-3:]
+    assert at_best < 1.5
+    assert at_one == pytest.approx(twice, rel=0.2)
+    assert at_hundred == pytest.approx(1.0 + 19.0 * TAKEN_UP, rel=0.2)
+
+
+def with_others(view: View, place: tuple[float, ...], light: float, noise: Floats) -> tuple[Floats, bool]:
+    """Return standard errors (4,) that cover other places, where they were small, and whether there is another depth.
+
+    `noise` (pixels,) is of the image in standard errors.
+    """
+    particle = np.array([[*place, light]])
+    variance = READ_COUNTS**2 + 2.0 * light_on(view, particle, DEPTHS)
+    residual = noise * np.sqrt(variance)
+    observation = observation_of(view, residual.copy(), 1.0 / variance, DEPTHS)
+    covariance = np.diag(np.square([*SURE_MM, 0.01 * light]))[np.newaxis]
+    found, other = search.with_other_places(observation, particle, covariance, np.ones(1), 0.0)
+    np.testing.assert_allclose(observation.residual, residual, atol=1e-6)
+    return np.sqrt(np.diagonal(found[0])), bool(other[0])
+
+
+def test_errors_cover_another_depth_that_explains_the_light(view: View, rng: np.random.Generator) -> None:
+    noise = rng.normal(size=view.camera.rows * view.camera.columns)
+    # In the middle of a lens, which holds all of its light, half a millimetre further off will do as well.
+    sigma, ambiguous = with_others(view, (0.0, 0.0, 0.25), 3e4, noise)
+    assert ambiguous
+    assert 0.3 < 1.96 * sigma[2] < 0.8
+    # Between two lenses, and where many are lit, one place alone.
+    for place in ((0.04, 0.02, 0.4), (0.0, 0.0, 1.1)):
+        sigma, ambiguous = with_others(view, place, 3e5, noise)
+        assert not ambiguous
+        np.testing.assert_allclose(sigma[:3], SURE_MM)
+
+
+def test_errors_cover_the_lens_that_holds_all_of_the_light(view: View) -> None:
+    # The other end of where it may be lies 0.03 mm off.
+    for axis, place in enumerate(((0.015, 0.0, 0.0), (0.0, 0.015, 0.0))):
+        sigma, _ = with_others(view, place, 2e4, np.zeros(view.camera.rows * view.camera.columns))
+        assert 0.03 < 1.96 * sigma[axis] < 0.06
+
+
+@pytest.mark.thorough
+def test_errors_do_not_grow_for_tracers_lost_elsewhere(table2: Camera, water: Media, rng: np.random.Generator) -> None:
+    true = np.array([[-0.6, 0.0, 1.5, 5e5], [0.6, 0.0, 1.5, 5e5]])
+    task = task_with(table2, water, true, rng)
+    covariance = []
+    for shown in (true, true[:1]):
+        state = replace(search.rebuilt(task, blank(task), shown), noise=search.noise_with(task, 5e5))
+        covariance.append(search.result(task, state).covariance_mm2[0])
+    # Left alone 0.7 of the light is.
+    np.testing.assert_allclose(np.diag(covariance[1]), np.diag(covariance[0]), rtol=0.1)
+
+
+def test_changes_are_those_of_independent_errors(view: View, monkeypatch: pytest.MonkeyPatch) -> None:
+    # In place of light: what the squares of size and diffusion are.
+    scene = view.scale.lens_mm
+
+    def with_diffusion(sized: View, diffusion_px: float) -> View:
+        return sized._replace(diffusion_px=diffusion_px)
+
+    def add_all(sized: View, _: object, sign: float, image: Floats, depths: object) -> None:
+        image += sign * (3.0 * (2.0 * sized.particle_radius_mm / scene) ** 2 + 5.0 * sized.diffusion_px**2)
+
+    monkeypatch.setattr(search, "with_diffusion", with_diffusion)
+    monkeypatch.setattr(search, "add_all", add_all)
+    covariance = np.array([[4e-4, -1e-4], [-1e-4, 2e-4]])
+    for diameter in (0.5, 0.01):
+        sized = view._replace(particle_radius_mm=0.5 * diameter * scene, diffusion_px=0.3)
+        changes = search.changes_of_light(sized, np.zeros((0, 4)), covariance, (0.0, 1.0))[:, 0]
+        slopes = np.array([3.0, 5.0])
+        assert changes @ changes == pytest.approx(slopes @ covariance @ slopes)
+
+
+DEPTHS = (-3.0, 3.0)
+READ_COUNTS = 6.0
+# Standard errors of a particle in many lenses.
+SURE_MM = (1e-4, 1e-4, 5e-3)
+
+
+@pytest.fixture
+def small_camera(table2: Camera) -> Camera:
+    return replace(table2, columns=300, rows=280)
+
+
+def focus_told(
+    small_camera: Camera, water: Media, times: float, count: int, rng: np.random.Generator
+) -> FocalLength | None:
+    """Return what tracers tell whose images are of so many times the focal length that is said."""
+    particles = rng.uniform((-0.5, -0.5, -2.5, 4e5), (0.5, 0.5, 2.5, 6e5), (count, 4))
+    other = replace(small_camera, microlens_focal_length_mm=times * small_camera.microlens_focal_length_mm)
+    view, seen = (raw_view(each, water, 0.025) for each in (small_camera, other))
+    image = light_on(seen, particles, DEPTHS)
+    variance = READ_COUNTS**2 + 2.0 * image
+    image += rng.normal(0.0, np.sqrt(variance))
+    return focal_length_of(view, particles, image - light_on(view, particles, DEPTHS), 1.0 / variance)
+
+
+def test_many_tracers_show_the_focal_length(small_camera: Camera, water: Media, rng: np.random.Generator) -> None:
+    found = focus_told(small_camera, water, 0.98, 15, rng)
+    assert found is not None
+    # One step from 2 % away falls short of it by what the light is not linear in, a tenth.
+    assert found.off == pytest.approx(-0.02, rel=0.15)
+    assert abs(found.off) > 10.0 * found.sigma
+    found = focus_told(small_camera, water, 1.0, 15, rng)
+    assert found is not None
+    assert abs(found.off) < 4.0 * found.sigma < 0.004
+    assert focus_told(small_camera, water, 1.0, FEWEST_PARTICLES - 1, rng) is None
+
+
+@pytest.fixture(scope="module")
+def bench(tmp_path_factory: pytest.TempPathFactory) -> Bench:
+    """What images of a small rig share: 20 x 23 microlenses on the sensor, 10 planes of 0.1 mm."""
+    small = ("columns: 600, rows: 448", "columns: 420, rows: 380"), ("[30, 22, 40]", "[16, 14, 10]"), AT_FOCUS
+    rig = sample_rig(tmp_path_factory.mktemp("rig"), *small, ("centre_mm: [0, 0, 0]", "centre_mm: [0, 0, 1.9]"))
+    content: WeightsFile = lf.build_weights(lf.load_rig(rig))
+    return bench_of(content, carried_config(content.provenance, "weights"), None, None)
+
+
+def image_of(bench: Bench, number: float, seed: int) -> np.ndarray:
+    """Return an image of so many tracers for each microlens, also around the volume."""
+    content, rng = bench.content, np.random.default_rng(seed)
+    low, high = np.array([-1.2, -1.1, 1.4]), np.array([1.2, 1.1, 2.4])
+    count = rng.poisson(number * 2.4 * 2.2 / 0.1**2)
+    view = raw_view(content.camera, bench.settings.media_model(), 0.025)
+    places = content.camera.to_image_axes(rng.uniform(low, high, (count, 3)))
+    image = rng.normal(100.0, 6.0, content.camera.rows * content.camera.columns)
+    particles = np.column_stack([places, rng.uniform(3e5, 7e5, count)])
+    add_all(view, particles, 1.0, image, content.weights.grid.bounds_mm(2))
+    return image.reshape(content.image_shape).astype(np.float32)
+
+
+def test_tracers_are_fitted_behind_the_vignetting_of_the_white_image(bench: Bench) -> None:
+    vignetting = np.zeros((5, 5))
+    vignetting[0, 0], vignetting[0, 2], vignetting[2, 0] = 1.0, -0.2, -0.3
+    image, content = image_of(bench, 0.1, 0), replace(bench.content, vignetting=vignetting)
+    frame = frame_of(bench, image, image)
+    view, plain = (task_for(replace(bench, content=each), frame).view for each in (content, bench.content))
+    lit = [light_on(each, np.array([[0.6, -0.5, 1.8, 1e5]]), (1.4, 2.4)) for each in (view, plain)]
+    surface = vignetting_surface(vignetting, content.image_shape).ravel()
+    np.testing.assert_allclose(lit[0], surface * lit[1], atol=1e-6 * lit[1].max())
+    assert surface[lit[1] > 0.0].max() < 0.95
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("number", [0.3, 3.0])
+def test_few_and_crowded_tracers_are_counted(bench: Bench, number: float) -> None:
+    counts = [tracers_per_lens(bench, frame_of(bench, *[image_of(bench, number, seed)] * 2)) for seed in range(3)]
+    # Some 200 microlenses, some five of which share a tracer's light, tell the variance of one image to a fifth.
+    assert np.mean(counts) == pytest.approx(number, rel=0.2)
+
+
+@pytest.mark.parametrize("depth", [0.1, 1.6, 2.4])
+def test_a_single_faint_tracer_is_no_crowd(bench: Bench, depth: float) -> None:
+    # The dark pixels' own noise, as light that all microlenses share, made it 10 to 40 for each of them.
+    image, content = np.random.default_rng(0).normal(0.0, 6.0, bench.content.image_shape), bench.content
+    tracer = np.array([[0.05, -0.03, depth, 1e4]])
+    add_all(raw_view(content.camera, bench.settings.media_model(), 0.025), tracer, 1.0, image.ravel(), (0.0, 2.5))
+    image = image.astype(np.float32)
+    counted = tracers_per_lens(bench, frame_of(bench, image, image))
+    assert counted is not None
+    assert counted < 0.2
+
+
+@pytest.mark.thorough
+def test_tracers_are_counted_few_or_crowded_and_light_that_does_not_tell_is_not(bench: Bench) -> None:
+    image = image_of(bench, 0.5, 0)
+    masked = np.full_like(image, np.nan)
+    masked[:100, :100] = image[:100, :100]
+    assert tracers_per_lens(bench, frame_of(bench, masked, np.nan_to_num(masked))) is None
+    assert tracers_per_lens(bench, frame_of(bench, *[np.zeros_like(image)] * 2)) is None
+    # Tracers that cannot be told apart are counted.
+    image = image_of(bench, 12.0, 0) - np.float32(100.0)
+    frame = frame_of(bench, image, image)
+    points = points_of(bench, frame, find(bench, frame), TracerSize(0.05), {})
+    # What they light is nearly explained, by particles that are not there.
+    model, crowded = light_notices(points, "crowded")
+    assert (model.code, crowded.code) == ("light-model", "particles-crowded")
+    # Two standard errors of what one image of so few microlenses tells.
+    assert crowded.measured == pytest.approx(12.0, rel=0.4)
+
+
+def test_crowded_tracers_are_not_taken_for_noise(bench: Bench) -> None:
+    # No pixel is as dark as without light, and most lie far from the median.
+    crowd = image_of(bench, 12.0, 0)
+    noise = np.random.default_rng(0).normal(0.0, 6.0, crowd.shape).astype(np.float32)
+    for image, told in ((crowd, False), (noise, True), (noise + np.float32(100.0), True)):
+        assert ("frame-dark" in {each.code for each in frame_notices(bench, image, image, "a")}) == told

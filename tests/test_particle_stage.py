@@ -1,11 +1,13 @@
 """`reconstruct --solver particles` and `track` as commands, to the vectors of particles at full size."""
 
 import json
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
 import pytest
 import tifffile
+from numpy.typing import ArrayLike
 from scipy.spatial import KDTree
 from threadpoolctl import threadpool_limits
 
@@ -25,7 +27,8 @@ from lfpiv_cli.files.particle_file import (
 from lfpiv_cli.files.vtkhdf import open_vectors
 from lfpiv_cli.grid import Reference
 from lfpiv_cli.validation.volume import particle_figures
-from tests.commands import CONFIG, SAMPLE, run
+from tests.commands import CONFIG, SAMPLE, run, told
+from tests.read_back import vtk_opened
 
 LOW, HIGH = (-1.5, -1.1, -2.0), (1.5, 1.1, 2.0)
 
@@ -49,21 +52,22 @@ def write_frame(path: Path, position_mm: np.ndarray, **changes: object) -> None:
     particle_file.write_points(path, PARTICLES_FORMAT, points, overwrite=True)
 
 
-@pytest.fixture
-def pair(tmp_path: Path, rng: np.random.Generator) -> tuple[Path, Path]:
-    """Particles of two frames in the sample's volume, all moved by (2, -1, 0.5) voxels."""
-    start, paths = rng.uniform(LOW, HIGH, (300, 3)), (tmp_path / "a.vtkhdf", tmp_path / "b.vtkhdf")
-    write_frame(paths[0], start)
-    write_frame(paths[1], start + (0.2, -0.1, 0.05))
+def write_frames(folder: Path, start: np.ndarray, step_mm: ArrayLike, numbers: Iterable[int] = (0, 1)) -> list[Path]:
+    """Write frames of particles that move by so much from number to number."""
+    paths = [folder / f"frame_{number}.vtkhdf" for number in numbers]
+    for number, path in zip(numbers, paths, strict=True):
+        write_frame(path, start + number * np.asarray(step_mm))
     return paths
 
 
-def test_track_writes_tracks_and_vectors(
-    pair: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    run("track", *pair, "-o", tmp_path / "tracks.vtkhdf", "--grid", "--json")
-    summary = json.loads(capsys.readouterr().out)
-    assert summary["tracks"] > 290
+@pytest.fixture
+def pair(tmp_path: Path, rng: np.random.Generator) -> list[Path]:
+    """Particles of two frames in the sample's volume, all moved by (2, -1, 0.5) voxels."""
+    return write_frames(tmp_path, rng.uniform(LOW, HIGH, (300, 3)), (0.2, -0.1, 0.05))
+
+
+def test_track_writes_tracks_and_vectors(pair: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert told(capsys, "track", *pair, "-o", tmp_path / "tracks.vtkhdf", "--grid")["tracks"] > 290
     tracks = read_points(tmp_path / "tracks.vtkhdf", TRACKS_FORMAT)
     # 2 voxels of 0.1 mm in 2 ms.
     np.testing.assert_allclose(np.median(tracks.arrays["velocity"], axis=0), (0.1, -0.05, 0.025), atol=1e-9)
@@ -98,20 +102,19 @@ def frames_of(counts: list[int], folder: Path, rng: np.random.Generator) -> list
     ],
 )
 def test_few_particles_are_tracked_and_said(
-    counts: list[int],
-    said: str,
-    tracks: int,
     tmp_path: Path,
     rng: np.random.Generator,
     capsys: pytest.CaptureFixture[str],
+    counts: list[int],
+    said: str,
+    tracks: int,
 ) -> None:
-    paths = frames_of(counts, tmp_path, rng)
-    run("track", *paths, "-o", tmp_path / "tracks.vtkhdf")
-    told = capsys.readouterr().err
-    assert said in told
-    assert ("lfpiv:" in told) == bool(said)
-    run("track", *paths, "-o", tmp_path / "tracks.vtkhdf", "--json", "--overwrite")
-    summary = json.loads(capsys.readouterr().out)
+    command = ("track", *frames_of(counts, tmp_path, rng), "-o", tmp_path / "tracks.vtkhdf")
+    run(*command)
+    error = capsys.readouterr().err
+    assert said in error
+    assert ("lfpiv:" in error) == bool(said)
+    summary = told(capsys, *command, "--overwrite")
     assert summary["tracks"] == tracks
     # Forty tracks of three places show no noise: a parabola takes them all.
     assert summary.get("noise_over_stated") is None
@@ -155,10 +158,7 @@ def test_vectors_beyond_the_walls_are_masked(tmp_path: Path, rng: np.random.Gene
 
 @pytest.mark.thorough
 def test_a_sequence_gives_tracks_and_vectors_of_each_interval(tmp_path: Path, rng: np.random.Generator) -> None:
-    start = rng.uniform(LOW, HIGH, (300, 3))
-    frames = [tmp_path / f"frame_{number}.vtkhdf" for number in range(4)]
-    for number, path in enumerate(frames):
-        write_frame(path, start + number * np.array([0.1, -0.05, 0.025]))
+    frames = write_frames(tmp_path, rng.uniform(LOW, HIGH, (300, 3)), (0.1, -0.05, 0.025), range(4))
     run("track", *frames, "-o", tmp_path / "tracks.vtkhdf", "--grid", "--shortest", 4)
     tracks = read_points(tmp_path / "tracks.vtkhdf", TRAJECTORIES_FORMAT)
     # 1 voxel of 0.1 mm in 2 ms; each place is a row, in the order of tracks and frames.
@@ -171,16 +171,12 @@ def test_a_sequence_gives_tracks_and_vectors_of_each_interval(tmp_path: Path, rn
         field = vtkhdf.open_vectors(tmp_path / f"tracks_grid_{name}.vtkhdf")
         assert np.abs(field.displacement_voxel[field.flag == 0] - (1.0, -0.5, 0.25)).max() < 1e-6
     assert not (tmp_path / "tracks_grid_0003.vtkhdf").exists()
-    vtk = pytest.importorskip("vtkmodules.vtkIOHDF")
-    reader = vtk.vtkHDFReader()
-    reader.SetFileName(str(tmp_path / "tracks.vtkhdf"))
-    reader.Update()
-    data = reader.GetOutput()
+    data = vtk_opened(tmp_path / "tracks.vtkhdf").GetOutput()
     assert (data.GetNumberOfPoints(), data.GetNumberOfLines()) == (number.size, len(number))
     assert data.GetCell(number.size).GetNumberOfPoints() == 4
 
 
-def test_what_cannot_be_tracked_is_refused(pair: tuple[Path, Path], tmp_path: Path) -> None:
+def test_what_cannot_be_tracked_is_refused(pair: list[Path], tmp_path: Path) -> None:
     output = ("-o", tmp_path / "tracks.vtkhdf")
     for arguments in (["a.vtkhdf"], ["a.vtkhdf", "b.vtkhdf", "--shortest", "3"]):
         with pytest.raises(UsageError):
@@ -284,9 +280,8 @@ def particles(tmp_path: Path, rng: np.random.Generator) -> Path:
     folder = tmp_path / "particles"
     folder.mkdir()
     for number in range(3):
-        start = rng.uniform(LOW, HIGH, (40, 3))
-        for k, letter in enumerate("ab"):
-            write_frame(folder / f"{letter}{number}.vtkhdf", start + k * MOVED_MM)
+        for letter, path in zip("ab", write_frames(folder, rng.uniform(LOW, HIGH, (40, 3)), MOVED_MM), strict=True):
+            path.rename(folder / f"{letter}{number}.vtkhdf")
     return folder
 
 
@@ -313,23 +308,18 @@ def test_each_pair_has_a_file_of_its_own(particles: Path, tmp_path: Path, capsys
 @pytest.mark.thorough
 def test_what_is_complete_is_skipped(particles: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = tmp_path / "tracks"
-    batch = ("track", particles, "--pairing", "ab", "-o", folder, "--json")
-    run(*batch)
-    assert json.loads(capsys.readouterr().out)["tracks"] == 120
+    batch = ("track", particles, "--pairing", "ab", "-o", folder)
+    assert told(capsys, *batch)["tracks"] == 120
     with pytest.raises(OutputExistsError):
         run(*batch)
     before = {path.name: path.stat().st_mtime_ns for path in folder.iterdir()}
-    capsys.readouterr()
-    run(*batch, "--resume")
-    assert json.loads(capsys.readouterr().out)["skipped"] == 3
+    assert told(capsys, *batch, "--resume")["skipped"] == 3
     assert {path.name: path.stat().st_mtime_ns for path in folder.iterdir()} == before
     # The vectors are missing: tracks are made again with them.
     run(*batch, "--resume", "--grid")
     (folder / "a1_grid.vtkhdf").unlink()
-    capsys.readouterr()
-    run(*batch, "--resume", "--grid")
-    told = json.loads(capsys.readouterr().out)
-    assert (told["skipped"], told["tracks"]) == (2, 40)
+    summary = told(capsys, *batch, "--resume", "--grid")
+    assert (summary["skipped"], summary["tracks"]) == (2, 40)
     assert len(list(folder.iterdir())) == 6
 
 
@@ -367,14 +357,13 @@ def test_one_pair_is_one_file(particles: Path, tmp_path: Path, capsys: pytest.Ca
 def test_a_sequence_is_in_the_order_of_its_numbers(
     tmp_path: Path, rng: np.random.Generator, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    start = rng.uniform(LOW, HIGH, (40, 3))
-    paths = [tmp_path / f"frame_{number}.vtkhdf" for number in (8, 9, 10, 12)]
-    for number, path in enumerate(paths):
-        write_frame(path, start + number * MOVED_MM)
+    paths = write_frames(tmp_path, rng.uniform(LOW, HIGH, (40, 3)), MOVED_MM, range(4))
+    paths = [
+        path.rename(tmp_path / f"frame_{number}.vtkhdf") for path, number in zip(paths, (8, 9, 10, 12), strict=True)
+    ]
     # As a shell sorts them.
-    run("track", *sorted(paths), "-o", tmp_path / "tracks.vtkhdf", "--json")
-    told = json.loads(capsys.readouterr().out)
-    assert [each["code"] for each in told["warnings"]] == ["frames-missing", "frames-reordered"]
+    summary = told(capsys, "track", *sorted(paths), "-o", tmp_path / "tracks.vtkhdf")
+    assert [each["code"] for each in summary["warnings"]] == ["frames-missing", "frames-reordered"]
     tracks = read_points(tmp_path / "tracks.vtkhdf", TRAJECTORIES_FORMAT)
     np.testing.assert_allclose(tracks.arrays["velocity"], np.tile(MOVED_MM / 2.0, (160, 1)), atol=1e-9)
     run("correlate", tmp_path / "tracks.vtkhdf", "--mean", tmp_path / "mean.vtkhdf")
@@ -403,10 +392,8 @@ def test_a_recorded_pair(data_folder: Path, tmp_path: Path) -> None:
     data = data_folder / "channel"
     vectors = vectors_of(CONFIG.parent / "channel.yaml", data, tmp_path)
     # What particles reached when this was written.
-    found, true = (
-        read_points(tmp_path / "particles" / "pair_a.vtkhdf", PARTICLES_FORMAT),
-        read_particles(data / "particles.npz"),
-    )
+    found = read_points(tmp_path / "particles" / "pair_a.vtkhdf", PARTICLES_FORMAT)
+    true = read_particles(data / "particles.npz")
     places = found.reference.points_to_focal_point(found.position_mm)
     moved = true.positions_mm + true.velocities_m_s * 1e3 * -0.0009
     low, high = np.array([-6.5, -5.0, -5.46]), np.array([6.5, 5.0, 4.53])

@@ -1,7 +1,6 @@
 """The tracers' diameter and the sensor's diffusion by images: what is true comes out, and what contradicts is told."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,16 +11,14 @@ from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.camera import Camera, Lattice
 from lfpiv_cli.optics.line_responses import USUAL_DIFFUSION_PX
 from lfpiv_cli.optics.media import Media
-from lfpiv_cli.particles.diameter import NO_SIZES, Diameter, Sizes, Trial, _settled_sizes, diameter_by, diameter_of
+from lfpiv_cli.particles.diameter import NO_SIZES, Diameter, Sizes, diameter_by, diameter_of
 from lfpiv_cli.particles.diffusion import MODEL_SHARE, MODEL_SQUARES, Forms, forms_of, together_of
-from lfpiv_cli.particles.search import Task, task_of
-from lfpiv_cli.particles.view import Light, entry_capacity, raw_view, with_radius
-from lfpiv_cli.reconstruction.solvers import normalisers
+from lfpiv_cli.particles.search import Task
+from lfpiv_cli.particles.view import Light, raw_view, with_radius
 from lfpiv_cli.verbs.tracers import Diffusion, TracerSize, size_notices
-from lfpiv_cli.weights.model import Weights
 from tests.commands import ROOT
-from tests.particle_images import light_on
-from tests.particle_twin import respond_once
+from tests.particle_images import light_on, task_for
+from tests.particle_twin import twin_image
 
 LENS_MM = 0.1
 DEPTHS_MM = (0.4, 2.1)
@@ -39,19 +36,12 @@ def image_of(camera: Camera, media: Media, tracers: Floats, lenses: float, waves
 
 
 def tasks_of(
-    camera: Camera,
-    media: Media,
-    images: list[Floats],
-    rng: np.random.Generator,
-    assumed: float = 0.5,
-    waves: Light | None = None,
+    camera: Camera, media: Media, images: list[Floats], rng: np.random.Generator, assumed: float = 0.5, **how: Light
 ) -> list[Task]:
     """Return the tasks that images set whose tracers are taken to be so many microlenses wide."""
     grid = Grid.centred((11, 10, 9), (0.1, 0.1, 0.2), (0.0, 0.0, 1.25))
-    weights = Weights.factorised(camera, media, grid)
-    view, sums = raw_view(camera, media, 0.5 * assumed * LENS_MM, light=waves), normalisers(weights.padded)
     noisy = [rng.poisson(0.5 * image) / 0.5 + rng.normal(0.0, 6.0, image.shape) for image in images]
-    return [task_of(image.astype(np.float32), view, weights, camera, sums) for image in noisy]
+    return [task_for(image, camera, media, grid, 0.5 * assumed * LENS_MM, **how) for image in noisy]
 
 
 @pytest.mark.thorough
@@ -77,7 +67,7 @@ def test_by_waves_diffusion_is_found_too(table2: Camera, water: Media, rng: np.r
     camera = replace(table2, columns=260, rows=240)
     tracers = rng.uniform((-0.5, -0.45, 0.5, 2e5), (0.5, 0.45, 2.0, 6e5), (14, 4))
     image = image_of(camera, water, tracers, 0.6, Light(532e-6, 0.42, DEPTHS_MM))
-    found = diameter_by(tasks_of(camera, water, [image], rng, 0.3, Light(532e-6, 0.3, DEPTHS_MM)))
+    found = diameter_by(tasks_of(camera, water, [image], rng, 0.3, light=Light(532e-6, 0.3, DEPTHS_MM)))
     assert found is not None
     assert found.held is not None
     # Of so many tracers, by the model that made them; what a model gets wrong is in the stated errors alone.
@@ -89,13 +79,16 @@ def test_by_waves_diffusion_is_found_too(table2: Camera, water: Media, rng: np.r
 @pytest.mark.thorough
 @pytest.mark.parametrize("number", [60, 400])
 def test_crowded_diameters_are_right(table2: Camera, water: Media, rng: np.random.Generator, number: int) -> None:
-    # Some .9 and 6 tracers for each microlens.
+    # Some .9 and 6 tracers for each microlens: of six, ten of forty seem to stand alone, 0.72 microlenses wide.
     camera = replace(table2, columns=260, rows=240)
     tracers = rng.uniform((-0.7, -0.65, 0.5, 3e5), (0.7, 0.65, 2.0, 7e5), (number, 4))
-    found = diameter_by(tasks_of(camera, water, [image_of(camera, water, tracers, 0.5)], rng))
+    images = [image_of(camera, water, tracers, 0.5)] * (3 if number < 100 else 1)
+    found = diameter_by(tasks_of(camera, water, images, rng))
     assert (found is None) == (number > 100)
     if found is not None:
         assert found.lenses == pytest.approx(0.5, abs=2.0 * found.sigma_lenses)
+        # The two images of a pair are looked at, and no more.
+        assert len(found.frames) == 2
 
 
 @pytest.mark.thorough
@@ -111,7 +104,7 @@ def test_frames_are_taken_until_tracers_suffice(table2: Camera, water: Media, rn
     assert found.lenses == pytest.approx(0.8, abs=0.03)
 
 
-def test_sizes_of_frames_are_pooled_and_a_point_has_a_limit(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_sizes_of_frames_are_pooled_and_a_point_has_a_limit() -> None:
     assert diameter_of([NO_SIZES]) is None
     square, sigma = np.array([0.25, 0.26, 0.24, 0.25, 4.0]), np.full(5, 0.01)
     found = diameter_of([Sizes(square[:2], sigma[:2]), NO_SIZES, Sizes(square[2:], sigma[2:])])
@@ -124,20 +117,6 @@ def test_sizes_of_frames_are_pooled_and_a_point_has_a_limit(monkeypatch: pytest.
     assert not point.resolved
     # Three tracers know a square to 0.012.
     assert 0.1 < point.lenses + 3.0 * point.sigma_lenses < 0.25
-    # The two images of a pair are looked at; the second search begins with what the first one showed.
-    squares, begun = iter([0.25, 0.36, 0.49]), []
-    enough = np.full(10, 0.01)
-
-    def measured(_: object, diameter: float | None) -> Sizes:
-        begun.append(diameter)
-        return Sizes(next(squares) + 0 * enough, enough)
-
-    monkeypatch.setattr("lfpiv_cli.particles.diameter.measured_sizes", measured)
-    found = diameter_by([None, None, None])  # type: ignore[list-item]
-    assert found is not None
-    assert [each.lenses for each in found.frames] == pytest.approx([0.5, 0.6])
-    assert found.tracers == 20
-    assert begun == [None, pytest.approx(0.5)]
 
 
 @pytest.mark.thorough
@@ -145,15 +124,13 @@ def test_a_view_of_other_balls_is_that_made_for_them(table2: Camera, water: Medi
     for layout in ("square", "hexagonal"):
         camera = replace(table2, columns=120, rows=110, lattice=Lattice.regular(0.1, layout))
         small, large = (raw_view(camera, water, radius) for radius in (0.04, 0.1))
-        lit = []
-        for view in (with_radius(small, 0.1), large):
-            image = np.zeros(camera.rows * camera.columns)
-            room = entry_capacity(view, *DEPTHS_MM)
-            pixels, values = np.empty(room, np.int32), np.empty((room, 4))
-            count = respond_once(view, 0.02, -0.03, 1.3, pixels, values)
-            image[pixels[:count]] = values[:count, 0]
-            lit.append(image)
+        lit = [twin_image(view, (0.02, -0.03, 1.3))[:, 0] for view in (with_radius(small, 0.1), large)]
         np.testing.assert_allclose(lit[0], lit[1], atol=1e-12)
+
+
+def of_diffusion(*found: float, **known: bool) -> TracerSize:
+    """Return a size that is certain, with this diffusion."""
+    return TracerSize(0.05, 0.05, 0.002, True, Diffusion(*found, **known))
 
 
 @pytest.mark.parametrize(
@@ -167,39 +144,18 @@ def test_a_view_of_other_balls_is_that_made_for_them(table2: Camera, water: Medi
         (None, TracerSize(0.001, 0.001, 0.004), ["particle-diameter-limit"]),
         (None, TracerSize(0.05), ["particle-diameter-unknown"]),
         (0.05, TracerSize(0.05), []),
+        (None, of_diffusion(0.2, 0.21, 0.02, given=True, reported=True), []),
+        (None, of_diffusion(0.2, 0.31, 0.02, given=True, reported=True), ["diffusion"]),
+        (None, of_diffusion(0.31, 0.31, 0.02, reported=True), []),
+        (None, of_diffusion(0.31, 0.31, 0.09), ["diffusion-unknown"]),
+        (None, of_diffusion(USUAL_DIFFUSION_PX), ["diffusion-unknown"]),
+        # What is given is used where the images do not tell.
+        (None, of_diffusion(0.2, given=True), []),
     ],
 )
-def test_notices_of_the_diameter(given: float | None, size: TracerSize, codes: list[str]) -> None:
+def test_notices_of_diameter_and_diffusion(given: float | None, size: TracerSize, codes: list[str]) -> None:
     settings = load_rig(ROOT / "configs" / "table2.yaml").overridden("reconstruction", particle_diameter_mm=given)
     assert [notice.code for notice in size_notices(settings, size)] == codes
-
-
-def test_a_size_that_grows_beyond_all_tracers_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
-    searched = []
-
-    def grown(task: None, found: None, diameters: Floats, unexplained: float) -> Trial:
-        return Trial(1.2 * float(diameters.max()), np.zeros((5, 12)), np.ones(12, np.bool_))
-
-    monkeypatch.setattr("lfpiv_cli.particles.diameter._found", lambda _, size, __: (None, searched.append(size)))
-    monkeypatch.setattr("lfpiv_cli.particles.diameter._tried", grown)
-    assert _settled_sizes(None, 3.8, ()) is NO_SIZES  # type: ignore[arg-type]
-    assert searched == [3.8]
-    # Where a size is found with which no tracer holds, none stands alone.
-    monkeypatch.setattr(
-        "lfpiv_cli.particles.diameter._tried", lambda *_: Trial(0.5, np.zeros((5, 0)), np.zeros(0, np.bool_))
-    )
-    assert _settled_sizes(None, 0.5, ()) is NO_SIZES  # type: ignore[arg-type]
-
-
-@pytest.mark.parametrize(("count", "enough"), [(40, True), (20, True), (19, False), (10, False), (0, False)])
-def test_a_size_is_that_of_half_the_tracers(monkeypatch: pytest.MonkeyPatch, count: int, enough: bool) -> None:
-    losses = np.square(np.arange(-2.0, 3.0))[:, np.newaxis] * np.ones(40)
-    trial = Trial(0.5, losses, np.arange(40) < count)
-    monkeypatch.setattr("lfpiv_cli.particles.diameter._found", lambda *_: (SimpleNamespace(view=None), None))
-    monkeypatch.setattr("lfpiv_cli.particles.diameter._tried", lambda *_: trial)
-    monkeypatch.setattr("lfpiv_cli.particles.diameter.by_waves", lambda _: False)
-    # Six for each microlens, of which ten of forty seemed to stand alone, showed 0.72 microlenses in place of 0.5.
-    assert (_settled_sizes(None, 0.5, ()).square.size == count > 0) == enough  # type: ignore[arg-type]
 
 
 def test_images_that_contradict_each_other_are_told() -> None:
@@ -320,21 +276,3 @@ def test_files_state_diffusion_and_its_error_where_it_is_not_given() -> None:
     found = forms_of(grid, losses)
     np.testing.assert_allclose(found.matrix[0], matrix, rtol=1e-6)
     np.testing.assert_allclose(np.linalg.solve(found.matrix[0], found.right[0]), best, rtol=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("diffusion", "codes"),
-    [
-        (Diffusion(0.2, 0.21, 0.02, given=True, reported=True), []),
-        (Diffusion(0.2, 0.31, 0.02, given=True, reported=True), ["diffusion"]),
-        (Diffusion(0.31, 0.31, 0.02, reported=True), []),
-        (Diffusion(0.31, 0.31, 0.09), ["diffusion-unknown"]),
-        (Diffusion(USUAL_DIFFUSION_PX), ["diffusion-unknown"]),
-        # What is given is used where the images do not tell.
-        (Diffusion(0.2, given=True), []),
-    ],
-)
-def test_notices_of_diffusion(diffusion: Diffusion, codes: list[str]) -> None:
-    settings = load_rig(ROOT / "configs" / "table2.yaml")
-    size = TracerSize(0.05, 0.05, 0.002, True, diffusion)
-    assert [notice.code for notice in size_notices(settings, size)] == codes
