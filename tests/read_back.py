@@ -3,6 +3,7 @@
 import csv
 import json
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -135,13 +136,19 @@ def by_vtk(path: Path, content: Content) -> None:
         assert lines == lengths
 
 
-def by_playing(path: Path, content: Content) -> None:
+def vtk_opened(path: Path) -> Any:
+    """Return VTK's reader of its own HDF5 files, which has read a file."""
     vtk = pytest.importorskip("vtkmodules.vtkIOHDF")
-    from vtkmodules.util.numpy_support import vtk_to_numpy
-
     reader = vtk.vtkHDFReader()
     reader.SetFileName(str(path))
-    reader.UpdateInformation()
+    reader.Update()
+    return reader
+
+
+def by_playing(path: Path, content: Content) -> None:
+    reader = vtk_opened(path)
+    from vtkmodules.util.numpy_support import vtk_to_numpy
+
     frames = content.arrays.get("frame", np.zeros(1, int))
     assert reader.GetNumberOfSteps() == frames.max() + 1
     for step in range(reader.GetNumberOfSteps()):

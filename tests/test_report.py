@@ -10,13 +10,14 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.cli.main import cli
 from lfpiv_cli.console import Console
 from lfpiv_cli.errors import InputError, OutputExistsError, UsageError
 from lfpiv_cli.files.config import load_rig
 from lfpiv_cli.files.hdf5 import write_tree
 from lfpiv_cli.files.images import write_tiff
-from lfpiv_cli.files.pages import Page, Picture
+from lfpiv_cli.files.pages import Page
 from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, TRACKS_FORMAT, TRAJECTORIES_FORMAT, Points, write_points
 from lfpiv_cli.files.provenance import sha256
 from lfpiv_cli.files.vtkhdf import open_vectors, write_vectors, write_volume
@@ -30,7 +31,19 @@ from lfpiv_cli.verbs.plot import figures_of
 from lfpiv_cli.verbs.report import ReportOptions, report
 from tests.browser import CHROMIUM, opened
 from tests.commands import ROOT, run, table2_rig, told
-from tests.vector_fields import SHAPE, SIGMA_VOXEL, field_of, noise_mm, points_of, rotation_mm
+from tests.vector_fields import (
+    SHAPE,
+    SIGMA_VOXEL,
+    SPACING_MM,
+    VOXEL_MM,
+    field_of,
+    field_on,
+    noise_mm,
+    pair_tracks,
+    points_of,
+    rotation_mm,
+    steady_mm,
+)
 
 QUIET = Console(quiet=True)
 REFERENCE = Reference("focal_point", 0.0)
@@ -49,22 +62,21 @@ def record(command: str, *warnings: dict[str, Any]) -> dict[str, Any]:
     return made | ({"warnings": list(warnings)} if warnings else {})
 
 
+def put(path: Path, moved_mm: Floats, made: dict[str, Any], sigma_voxel: Floats = SIGMA_VOXEL) -> None:
+    """Write vectors of a flow with errors of stated size."""
+    write_vectors(path, field_of(moved_mm, sigma_voxel), REFERENCE, provenance=made, overwrite=False)
+
+
 @pytest.fixture
 def results(tmp_path: Path) -> Path:
     """A folder with vectors by volumes, vectors by tracks in a folder below, and the tracks."""
     folder = tmp_path / "results"
     (folder / "tracked").mkdir(parents=True)
     flow = 20.0 * rotation_mm()
-    for number, name in enumerate(("vectors.vtkhdf", "tracked/grid.vtkhdf")):
-        field = field_of(flow + noise_mm(number), SIGMA_VOXEL)
-        warnings = (WARNING,) if number else ()
-        write_vectors(folder / name, field, REFERENCE, provenance=record("correlate", *warnings), overwrite=False)
-    numbers = np.arange(TRACKS)
-    along = np.tile([0.3, 0.0, 0.1], (TRACKS, 1))
-    arrays = {"velocity": along, "velocity_sigma": 0.1 * along, "displacement_mm": along}
-    arrays |= {"particle_a": numbers, "particle_b": numbers, "link_probability": np.ones(TRACKS)}
-    position = np.random.default_rng(0).uniform(-2.0, 2.0, (TRACKS, 3))
-    points = Points(position, arrays, REFERENCE, {}, record("track"))
+    put(folder / "vectors.vtkhdf", flow + noise_mm(0), record("correlate"))
+    put(folder / "tracked" / "grid.vtkhdf", flow + noise_mm(1), record("correlate", WARNING))
+    position, along = np.random.default_rng(0).uniform(-2.0, 2.0, (TRACKS, 3)), np.tile([0.3, 0.0, 0.1], (TRACKS, 1))
+    points = pair_tracks(position, along, 0.01, 1e-3, record("track"), REFERENCE)
     write_points(folder / "tracks.vtkhdf", TRACKS_FORMAT, points, overwrite=False)
     return folder
 
@@ -167,11 +179,8 @@ def test_pictures_are_drawn_on_their_raw_image(results: Path, tmp_path: Path, mo
 @pytest.mark.thorough
 @pytest.mark.parametrize(("commands", "word"), [(("track", "correlate"), "good"), (("correlate", "correlate"), "look")])
 def test_poor_vectors_count_unless_better_ones_do(commands: tuple[str, str], word: str, tmp_path: Path) -> None:
-    flow = np.zeros((*SHAPE, 3))
-    flow[..., 0] = 1.0
     for name, command, sigma in zip("ab", commands, (SIGMA_VOXEL, [0.05, 0.02, 1.2]), strict=True):
-        field = field_of(flow, np.asarray(sigma))
-        write_vectors(tmp_path / f"{name}.vtkhdf", field, REFERENCE, provenance=record(command), overwrite=False)
+        put(tmp_path / f"{name}.vtkhdf", steady_mm(), record(command), np.asarray(sigma))
     summary = report(tmp_path, tmp_path / "page.html", console=QUIET)
     assert summary["verdict"]["vectors"] == word
     assert "w is known to 0.36 mm" in (tmp_path / "page.html").read_text(encoding="utf-8")
@@ -180,28 +189,17 @@ def test_poor_vectors_count_unless_better_ones_do(commands: tuple[str, str], wor
 @pytest.mark.thorough
 def test_vectors_of_different_times_are_not_held_against_each_other(tmp_path: Path) -> None:
     for number in range(3):
-        flow = np.zeros((*SHAPE, 3))
-        flow[..., 0] = 1.0 + number
-        field = field_of(flow, SIGMA_VOXEL)
-        made = record("correlate")
-        write_vectors(tmp_path / f"{number}.vtkhdf", field, REFERENCE, provenance=made, overwrite=False)
+        put(tmp_path / f"{number}.vtkhdf", steady_mm(1.0 + number), record("correlate"))
     assert report(tmp_path, tmp_path / "page.html", console=QUIET)["verdict"]["vectors"] == "good"
 
 
 @pytest.mark.thorough
 def test_all_but_the_best_have_one_figure(results: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(stage, "figures_of", figures_of)
-    drawn: list[str] = []
-
-    def noted(_self: object, caption: str, _figure: object) -> Picture:
-        drawn.append(caption.split(":")[0])
-        return Picture(tmp_path, caption)
-
-    monkeypatch.setattr(stage.Drawer, "_drawn", noted)
-    monkeypatch.setattr(stage, "write_pages", lambda *_given: None)
     grid = results / "tracked" / "grid.vtkhdf"
     write_vectors(grid, open_vectors(grid), REFERENCE, provenance=record("track"), overwrite=True)
     report(results, tmp_path / "page.html", console=QUIET)
+    drawn = re.findall(r"<figcaption>([\w.]+):", (tmp_path / "page.html").read_text(encoding="utf-8"))
     # alike in all else, the one whose name is first
     assert (drawn.count("grid.vtkhdf"), drawn.count("vectors.vtkhdf")) == (3, 1)
 
@@ -221,32 +219,21 @@ def test_the_first_line_tells_all_at_once(results: Path, tmp_path: Path, monkeyp
     assert [word for word, _ in remarks.points] == [""] * len(remarks.points)
 
 
-def few_planes(folder: Path, planes: int) -> set[str]:
+def few_planes(planes: int) -> set[str]:
     """Return what a field of some planes across z says against itself."""
-    flow = np.zeros((*SHAPE, 3))
-    flow[..., 0] = 1.0
-    field = field_of(flow, SIGMA_VOXEL)
-    cut = {
-        name: getattr(field, name)[:planes]
-        for name in ("displacement_voxel", "displacement_raw_voxel", "correlation", "peak_ratio", "valid_fraction")
-    }
-    grid = Grid((*SHAPE[:0:-1], planes), field.grid.spacing_mm, field.grid.origin_mm)
-    few = replace(field, grid=grid, flag=field.flag[:planes], uncertainty_voxel=field.uncertainty_voxel[:planes], **cut)
+    moved, grid = steady_mm()[:planes] / VOXEL_MM, Grid((*SHAPE[:0:-1], planes), SPACING_MM, (0.0, 0.0, 0.0))
+    few = field_on(grid, moved, None, np.broadcast_to(SIGMA_VOXEL, moved.shape), VOXEL_MM)
     return {line.reason for line in checks.of_vectors(few, "f") if line.verdict != "good"}
 
 
-def test_two_planes_are_not_good(tmp_path: Path) -> None:
-    assert few_planes(tmp_path, 3) == set()
-    assert any("planes of vectors along z: 2" in reason for reason in few_planes(tmp_path, 2))
+def test_two_planes_are_not_good() -> None:
+    assert few_planes(3) == set()
+    assert any("planes of vectors along z: 2" in reason for reason in few_planes(2))
 
 
 def test_the_verdict_is_of_tracks_where_volumes_beside_them_are_poor(tmp_path: Path) -> None:
-    flow = np.zeros((*SHAPE, 3))
-    flow[..., 0] = 1.0
-    for name, command, warnings in (("tracks_grid", "track", ()), ("vectors", "correlate", (WARNING,))):
-        made = record(command, *warnings)
-        field = field_of(flow + (5.0 * noise_mm(1) if name == "vectors" else 0.0), SIGMA_VOXEL)
-        write_vectors(tmp_path / f"{name}.vtkhdf", field, REFERENCE, provenance=made, overwrite=False)
+    put(tmp_path / "tracks_grid.vtkhdf", steady_mm(), record("track"))
+    put(tmp_path / "vectors.vtkhdf", steady_mm() + 5.0 * noise_mm(1), record("correlate", WARNING))
     contents = contents_of(tmp_path)
     fields = {path: open_vectors(path) for path in contents.of("vectors")}
     said = {line.reason: line.verdict for line in judged(contents, fields)["vectors"]}
@@ -264,11 +251,8 @@ def test_many_pairs_stand_in_order_without_empty_settings(tmp_path: Path, monkey
     monkeypatch.setattr(stage, "write_pages", lambda page, *_given: pages.append(page))
     made = record("correlate")
     made["config"] = {"camera": {"pitch_mm": 0.125, "name": None}, "pipe": {"axis": None}, "windows": [None, 8]}
-    flow = np.zeros((*SHAPE, 3))
     for number in (10, 9, 1):
-        flow[..., 0] = 0.1 * number
-        field = field_of(flow, SIGMA_VOXEL / number)
-        write_vectors(tmp_path / f"p{number}.vtkhdf", field, REFERENCE, provenance=made, overwrite=False)
+        put(tmp_path / f"p{number}.vtkhdf", steady_mm(0.1 * number), made, SIGMA_VOXEL / number)
     summary = report(tmp_path, tmp_path / "page.html", console=QUIET)
     sections = {section.title: section for section in pages[0].sections}
     table = sections["Vectors"].tables[0]
@@ -282,8 +266,7 @@ def test_many_pairs_stand_in_order_without_empty_settings(tmp_path: Path, monkey
     # of more files the first; of those by another command the series and planes of their mean
     monkeypatch.setattr(stage, "LONGEST_TABLE", 2)
     for number in (10, 9, 1):
-        field = field_of(flow, 9.0 * SIGMA_VOXEL)
-        write_vectors(tmp_path / f"t{number}.vtkhdf", field, REFERENCE, provenance=record("track"), overwrite=False)
+        put(tmp_path / f"t{number}.vtkhdf", steady_mm(0.1), record("track"), 9.0 * SIGMA_VOXEL)
     assert report(tmp_path, tmp_path / "page.html", console=QUIET)["pictures"] == 4 + 2
     vectors = next(section for section in pages[1].sections if section.title == "Vectors")
     assert vectors.text == ("The first 2 of 3 files.",)
@@ -358,21 +341,16 @@ def test_wrong_names_outputs_and_images_are_refused_before_drawing(volume, tmp_p
     write_tree(other, {"a_mm": np.zeros(9)}, format_name="x", format_version=1, provenance={}, overwrite=True)
     with pytest.raises(InputError, match="x has no figures"):
         figures_of(other)
-    rng = np.random.default_rng(1)
-    path = tmp_path / "t.vtkhdf"
-    write_points(path, TRACKS_FORMAT, points_of(TRACKS_FORMAT, rng), overwrite=True)
-    assert list(figures_of(path)) == ["space", "velocities", "links", "sigma"]
-    write_points(path, TRAJECTORIES_FORMAT, points_of(TRAJECTORIES_FORMAT, rng), overwrite=True)
-    figures = figures_of(path)
-    assert list(figures) == ["space", "lengths", "velocities", "links", "sigma"]
-    assert figures["space"].draw().axes[0].get_title() == "4 trajectories"
     rows = re.findall(r"^\| ([\w ]+) \| (`.*`) \|$", (ROOT / "docs" / "files.md").read_text(), re.MULTILINE)
     listed = {what: [name.strip("`") for name in names.split(", ")] for what, names in rows}
-    rng = np.random.default_rng(1)
-    for what, of_format in (("tracks of a pair", TRACKS_FORMAT), ("tracks of a sequence", TRAJECTORIES_FORMAT)):
-        path = tmp_path / "t.vtkhdf"
+    path, rng, names = tmp_path / "t.vtkhdf", np.random.default_rng(1), ["velocities", "links", "sigma"]
+    for what, of_format, first in (
+        ("tracks of a pair", TRACKS_FORMAT, ["space"]),
+        ("tracks of a sequence", TRAJECTORIES_FORMAT, ["space", "lengths"]),
+    ):
         write_points(path, of_format, points_of(of_format, rng), overwrite=True)
-        assert listed[what] == list(figures_of(path))
+        assert listed[what] == list(figures_of(path)) == first + names
+    assert figures_of(path)["space"].draw().axes[0].get_title() == "4 trajectories"
     assert listed["volume"] == list(figures_of(volume))
     assert len(listed) == 7
 

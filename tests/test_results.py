@@ -25,7 +25,7 @@ from lfpiv_cli.verbs.checks import FOR_INFORMATION, Line, of_two_ways, of_vector
 from lfpiv_cli.verbs.plot import figures_of
 from lfpiv_cli.verbs.results import KINDS
 from tests.commands import ROOT, table2_rig
-from tests.vector_fields import SHAPE, SIGMA_VOXEL, VOXEL_MM, field_of, field_on, noise_mm, rotation_mm
+from tests.vector_fields import SHAPE, SIGMA_VOXEL, VOXEL_MM, field_of, field_on, noise_mm, rotation_mm, steady_mm
 from tests.written_files import WrittenFiles
 
 # The kinds of files that are opened, and what opens them.
@@ -213,11 +213,7 @@ def test_info_counts_vectors_by_flag_and_gives_medians(tmp_path):
     flag = np.array([VALID, REPLACED, REJECTED], np.uint8).reshape(3, 1, 1)
     grid = Grid.centred((1, 1, 3), (0.1, 0.1, 0.1), (0.0, 0.0, 0.0))
     field = field_on(grid, displacement, flag, sigma)
-    made = {
-        "command": "correlate",
-        "warnings": [dict.fromkeys(("about", "text", "remedy"), "a") | {"code": "few-tracers"}],
-    }
-    write_vectors(path, field, AT_FOCUS, provenance=made, overwrite=True)
+    write_vectors(path, field, AT_FOCUS, provenance=made("correlate", "few-tracers"), overwrite=True)
     found = json.loads(run("info", str(path), "--json"))
     assert (found["vectors"], found["valid_share"]) == (3, pytest.approx(1.0 / 3.0))
     counts = [found[f"vectors_{name}"] for name in ("valid", "replaced", "second_peak", "rejected", "masked")]
@@ -264,11 +260,8 @@ TROUBLESHOOTING = ROOT / "docs" / "troubleshooting.md"
 
 
 def made(command: str, *codes: str) -> dict[str, Any]:
-    warnings = [
-        {"code": code, "about": "a.tif", "text": f"found {code}", "remedy": "mend it", "measured": None}
-        for code in codes
-    ]
-    return {"command": command, "warnings": warnings}
+    warning = {"about": "a.tif", "remedy": "mend it", "measured": None}
+    return {"command": command, "warnings": [warning | {"code": code, "text": f"found {code}"} for code in codes]}
 
 
 def words(lines: list[Line]) -> dict[str, str]:
@@ -303,19 +296,15 @@ def test_vectors_as_good_as_they_state_and_not() -> None:
     [_, reason] = of_vectors(field_of(noise_mm(0), SIGMA_VOXEL), "v")
     assert reason.verdict == "look"
     assert "standard deviations of zero" in reason.reason
-    flow = np.zeros((*SHAPE, 3))
-    flow[..., 0] = 1.0
-    reasons = of_vectors(field_of(flow, np.array([0.05, 0.02, 1.2])), "v")
+    reasons = of_vectors(field_of(steady_mm(), np.array([0.05, 0.02, 1.2])), "v")
     [reason] = [each for each in reasons if each.verdict == "look"]
     assert "w is known to 0.36 mm, 36% of the usual displacement" in reason.reason
-    assert words(of_vectors(field_of(flow, SIGMA_VOXEL), "v"))["vectors"] == "good"
+    assert words(of_vectors(field_of(steady_mm(), SIGMA_VOXEL), "v"))["vectors"] == "good"
     field = field_of(rotation_mm(), SIGMA_VOXEL)
-    field.flag[:] = REJECTED
-    assert words(of_vectors(field, "v"))["vectors"] == "no"
-    field.flag[:] = MASKED
-    assert words(of_vectors(field, "v"))["vectors"] == "no"
-    one = field_of(rotation_mm() + noise_mm(1), SIGMA_VOXEL)
-    same = field_of(rotation_mm() + noise_mm(2), SIGMA_VOXEL)
+    for flag in (REJECTED, MASKED):
+        field.flag[:] = flag
+        assert words(of_vectors(field, "v"))["vectors"] == "no"
+    one, same = (field_of(rotation_mm() + noise_mm(seed), SIGMA_VOXEL) for seed in (1, 2))
     off = field_of(rotation_mm() + noise_mm(3) + 8.0 * SIGMA_VOXEL * VOXEL_MM, SIGMA_VOXEL)
     assert of_two_ways(one, same, ("a", "b"))[0].verdict == "good"
     assert of_two_ways(one, off, ("a", "b"))[0].verdict == "look"

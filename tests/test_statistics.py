@@ -13,7 +13,7 @@ import lfpiv_cli as lf
 from lfpiv_cli.arrays import Floats
 from lfpiv_cli.errors import InputError, OutputExistsError, UsageError
 from lfpiv_cli.files.config import load_rig
-from lfpiv_cli.files.particle_file import TRACKS_FORMAT, Points, symmetric, write_points
+from lfpiv_cli.files.particle_file import TRACKS_FORMAT, Points, write_points
 from lfpiv_cli.files.provenance import record
 from lfpiv_cli.files.vtkhdf import open_vectors, write_vectors
 from lfpiv_cli.flow.field import MASKED, REJECTED, REPLACED, VALID, VectorField
@@ -22,8 +22,8 @@ from lfpiv_cli.grid import FOCAL_POINT, Grid
 from lfpiv_cli.synthetic.flows import pipe, random_modes, square_duct
 from lfpiv_cli.verbs.moments import FlowStatistics, notices_of, of_fields, of_tracks, parse_profile, profile_on
 from lfpiv_cli.verbs.plot import figures_of
-from tests.commands import CONFIG, run, told
-from tests.vector_fields import field_on
+from tests.commands import CONFIG, run, sample_rig, told
+from tests.vector_fields import field_on, pair_tracks
 
 SHAPE, DT_S, VOXEL_MM = (2, 3, 4), 1e-3, (0.1, 0.1, 0.1)
 TO_M_S = 1e-3 / DT_S
@@ -48,6 +48,10 @@ def gaussian(rng: np.random.Generator, frames: int, places: int, memory: float =
     for number in range(1, frames):
         drawn[number] = memory * drawn[number - 1] + np.sqrt(1.0 - memory**2) * drawn[number]
     return np.asarray(drawn @ np.linalg.cholesky(STRESSES).T)
+
+
+def told_of(found: FlowStatistics) -> list[str]:
+    return [each.code for each in notices_of(found.summary(), "it")]
 
 
 def fields(rng: np.random.Generator, count: int) -> list[VectorField]:
@@ -181,19 +185,8 @@ def tracks_of(places: Floats, velocity: Floats, sigma_mm: Floats, config: Path =
     """Return tracks of a pair at places, with errors of stated size."""
     rig = load_rig(config)
     dt_s = float(rig.correlation.dt_s or DT_S)
-    count, sigma = len(places), np.broadcast_to(sigma_mm, places.shape)
     moved = velocity * 1e3 * dt_s
-    arrays = {
-        "velocity": moved * 1e-3 / dt_s,
-        "velocity_sigma": sigma * 1e-3 / dt_s,
-        "displacement_mm": moved,
-        "displacement_covariance_mm2": symmetric(sigma[:, :, np.newaxis] ** 2 * np.eye(3)),
-        "particle_a": np.arange(count),
-        "particle_b": np.arange(count),
-        "link_probability": np.full(count, 0.99),
-    }
-    made = record("track", rig.resolved(), {})
-    return Points(places, arrays, FOCAL_POINT, FOCAL_POINT.attributes() | {"dt_s": dt_s}, made)
+    return pair_tracks(places, moved, sigma_mm, dt_s, record("track", rig.resolved(), {}), FOCAL_POINT)
 
 
 SIGMA_MM = np.array([0.005, 0.005, 0.03])
@@ -224,11 +217,10 @@ def test_shear_within_a_bin_is_no_fluctuation(rng: np.random.Generator) -> None:
     sigma = found.found.moments.sigma
     off = found.found.moments.stress / sigma[:, STRESS]
     assert np.sqrt(np.mean(off**2)) < 1.3
-    expected = np.stack(
-        [0.1 + 0.08 * found.mean.grid.centres_mm()[..., 2], 0.05 * found.mean.grid.centres_mm()[..., 0]]
+    away = found.mean.velocity - shear(found.mean.grid.centres_mm().reshape(-1, 3), 0).reshape(
+        found.mean.velocity.shape
     )
-    away = np.moveaxis(found.mean.velocity, -1, 0)[:2] - expected
-    stated = np.moveaxis(found.arrays()["velocity_sigma"][0], -1, 0)[:2]
+    away, stated = away[..., :2], found.arrays()["velocity_sigma"][0][..., :2]
     assert np.sqrt(np.mean((away / stated) ** 2)) == pytest.approx(1.0, abs=0.3)
     # Were it one, it would be a hundred standard errors.
     dt_s = float(found.mean.dt_s or DT_S)
@@ -251,7 +243,7 @@ def test_curved_means_in_bins_are_told(rng: np.random.Generator) -> None:
     tracks = measured(rng, curved, 30, 300, HALF_MM)
     for side, codes in ((1.3, ["bins-curved"]), (0.3, [])):
         found = of_tracks(tracks, (3.0, 2.2, side), 20, "z")
-        assert [each.code for each in notices_of(found.summary(), "it")] == codes
+        assert told_of(found) == codes
         # c^2 h^4 / 720 of the second derivative, in m^2/s^2, at the inner bins.
         curvature = np.nanmedian(found.curved_mm2[:, 0]) * (1e-3 / float(found.mean.dt_s or 1.0)) ** 2
         assert curvature == pytest.approx(0.12**2 * side**4 / 720.0, rel=0.2)
@@ -264,13 +256,11 @@ def test_the_stresses_of_turbulence_lie_within_their_errors(rng: np.random.Gener
     tracks = measured(rng, lambda places, number: flows[number](places), 60, 150, HALF_MM)
     found = of_tracks(tracks, (0.75, 0.7, 1.0), 20, "z")
     truth = np.array([4e-4, 4e-4, 4e-4, 0.0, 0.0, 0.0])
-    off = (found.found.moments.stress * found.scales[STRESS] - truth) / (found.found.moments.sigma * found.scales)[
-        :, STRESS
-    ]
+    moments, line = found.found.moments, found.found.profile
+    off = (moments.stress * found.scales[STRESS] - truth) / (moments.sigma * found.scales)[:, STRESS]
     # .95 less what variances of 60 pairs are skewed, .91, within what 48 bins scatter that are not independent.
     assert np.mean(np.abs(off) < 1.96) > 0.85
     assert np.all(np.abs(off.mean(axis=0)) < 1.2), off.mean(axis=0)
-    line = found.found.profile
     assert line is not None
     off = (line.stress * found.scales[STRESS] - truth) / (line.sigma * found.scales)[:, STRESS]
     assert np.sqrt(np.mean(off**2)) < 1.7
@@ -279,9 +269,7 @@ def test_the_stresses_of_turbulence_lie_within_their_errors(rng: np.random.Gener
 
 @pytest.mark.thorough
 def test_the_experiment_has_its_mean_no_stress(data_folder: Path, rng: np.random.Generator, tmp_path: Path) -> None:
-    text = CONFIG.read_text()
-    rig = tmp_path / "rig.yaml"
-    rig.write_text(text.replace("shape_xyz: [30, 22, 40]", "shape_xyz: [100, 90, 90]"))
+    rig = sample_rig(tmp_path, ("shape_xyz: [30, 22, 40]", "shape_xyz: [100, 90, 90]"))
     truth = np.load(data_folder / "channel" / "particles.npz")
     places, velocity = truth["position_mm"], 1e-3 * truth["velocity_mm_s"]
     middle = float(json.loads((data_folder / "channel" / "truth.json").read_text())["mid_plane_z_mm"])
@@ -305,7 +293,7 @@ def test_the_experiment_has_its_mean_no_stress(data_folder: Path, rng: np.random
     stress = found.found.moments.stress[there.ravel()] / found.found.moments.sigma[there.ravel(), STRESS]
     # The profile's curvature leaves some tenths of a standard error in u.
     assert np.sqrt(np.mean(stress**2)) < 1.4
-    assert [each.code for each in notices_of(found.summary(), "it")] == []
+    assert told_of(found) == []
 
 
 def test_profiles_around_an_axis_turn_what_they_average(rng: np.random.Generator) -> None:
@@ -351,10 +339,6 @@ def test_profiles_lie_where_they_are_asked_for(rng: np.random.Generator) -> None
         profile_on(grid, "x@y=3")
 
 
-def told_of(found: FlowStatistics) -> list[str]:
-    return [each.code for each in notices_of(found.summary(), "it")]
-
-
 def test_what_speaks_against_statistics_is_told_and_ordinary_ones_are_quiet(rng: np.random.Generator) -> None:
     def batch(values: Floats, sigma: float) -> FlowStatistics:
         first = fields(rng, 1)[0]
@@ -384,11 +368,8 @@ def folder(tmp_path: Path, rng: np.random.Generator) -> Path:
     (tmp_path / "vectors").mkdir()
     (tmp_path / "tracks").mkdir()
     for number, field in enumerate(fields(rng, 12)):
-        each = replace(
-            field,
-            displacement_voxel=field.displacement_voxel - 1e6 + [2.0, 0.0, 0.0],
-            uncertainty_voxel=np.full((*SHAPE, 3), 0.2),
-        )
+        moved = field.displacement_voxel - 1e6 + [2.0, 0.0, 0.0]
+        each = replace(field, displacement_voxel=moved, uncertainty_voxel=np.full((*SHAPE, 3), 0.2))
         write_vectors(tmp_path / "vectors" / f"v{number}.vtkhdf", each, FOCAL_POINT, provenance=made, overwrite=False)
     tracks = measured(rng, lambda places, _number: 0.1 + 0.0 * places, 12, 200, HALF_MM)
     for number, points in enumerate(tracks):

@@ -3,12 +3,12 @@
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from lfpiv_cli.arrays import Floats
 from lfpiv_cli.files.particle_file import OPTIONAL, UNITS, Points
 from lfpiv_cli.flow.field import VALID, VectorField
-from lfpiv_cli.grid import FOCAL_POINT, Grid
+from lfpiv_cli.grid import FOCAL_POINT, Grid, Reference
 
 SHAPE = (9, 10, 11)
 SPACING_MM = (0.8, 0.6, 1.1)
@@ -45,6 +45,17 @@ def points_of(
     return Points(rng.random((count, 3)), arrays, FOCAL_POINT, told, provenance or {})
 
 
+def pair_tracks(
+    position_mm: Floats, moved_mm: Floats, sigma_mm: ArrayLike, dt_s: float, made: dict[str, Any], reference: Reference
+) -> Points:
+    """Return tracks of a pair (n, 3) with independent errors of their displacements, of which all belong."""
+    sigma, count = np.broadcast_to(sigma_mm, position_mm.shape), len(position_mm)
+    arrays = {"velocity": moved_mm * 1e-3 / dt_s, "velocity_sigma": sigma * 1e-3 / dt_s, "displacement_mm": moved_mm}
+    arrays |= {"displacement_covariance_mm2": np.pad(sigma**2, ((0, 0), (0, 3)))}
+    arrays |= dict.fromkeys(("particle_a", "particle_b"), np.arange(count)) | {"link_probability": np.full(count, 0.99)}
+    return Points(position_mm, arrays, reference, reference.attributes() | {"dt_s": dt_s}, made)
+
+
 def field_of(moved_mm: Floats, sigma_voxel: Floats | None) -> VectorField:
     sigma = None if sigma_voxel is None else np.broadcast_to(sigma_voxel, (*SHAPE, 3)).copy()
     return field_on(Grid(SHAPE[::-1], SPACING_MM, (-4.0, 1.0, 2.0)), moved_mm / VOXEL_MM, None, sigma, VOXEL_MM)
@@ -62,3 +73,8 @@ def noise_mm(seed: int) -> Floats:
 def rotation_mm() -> Floats:
     """Return a rigid rotation about an oblique axis: large gradients, no divergence."""
     return np.cross([0.02, -0.03, 0.05], places_mm())
+
+
+def steady_mm(moved_mm: float = 1.0) -> Floats:
+    """Return a flow that moves as a whole along x."""
+    return np.broadcast_to([moved_mm, 0.0, 0.0], (*SHAPE, 3)).copy()
