@@ -172,10 +172,8 @@ def header(shape: str) -> bytes:
 def with_member(name: str, content: bytes) -> bytes:
     """Return a list of particles with other bytes in place of an array."""
     file = io.BytesIO()
-    with (
-        zipfile.ZipFile(io.BytesIO(packed(true_arrays()))) as old,
-        zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as new,
-    ):
+    old = zipfile.ZipFile(io.BytesIO(packed(true_arrays())))
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as new:
         for each in old.namelist():
             new.writestr(each, content if each == f"{name}.npy" else old.read(each))
     return file.getvalue()
@@ -252,6 +250,7 @@ def test_no_damage_is_anything_but_refused(tmp_path: Path) -> None:
     assert refused > 200
 
 
+needs_full = pytest.mark.skipif(not Path("/dev/full").exists(), reason="no device that is always full")
 LFPIV = f"'{sys.executable}' -m lfpiv_cli"
 
 
@@ -259,7 +258,7 @@ def shell(line: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(["bash", "-o", "pipefail", "-c", line], capture_output=True, text=True, timeout=60)
 
 
-@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no device that is always full")
+@needs_full
 @pytest.mark.thorough
 @pytest.mark.parametrize("closed", ["2>/dev/full", "<&- >&- 2>&-"])
 def test_a_rig_file_is_written_though_nothing_can_be_said(tmp_path: Path, closed: str) -> None:
@@ -268,7 +267,7 @@ def test_a_rig_file_is_written_though_nothing_can_be_said(tmp_path: Path, closed
     assert (tmp_path / "rig.yaml").stat().st_size > 100
 
 
-@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no device that is always full")
+@needs_full
 @pytest.mark.thorough
 @pytest.mark.parametrize(("closed", "code"), [("| true", 0), (">&-", 0), (">/dev/full", 7)])
 def test_a_lost_answer_fails_but_for_a_reader_that_has_gone(tmp_path: Path, closed: str, code: int) -> None:
@@ -280,7 +279,7 @@ def test_a_lost_answer_fails_but_for_a_reader_that_has_gone(tmp_path: Path, clos
 
 
 @pytest.mark.thorough
-@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no device that is always full")
+@needs_full
 def test_an_answer_goes_through_a_pipe_and_errors_keep_their_codes(tmp_path: Path) -> None:
     done = shell(f"{LFPIV} check '{CONFIG}' 2>/dev/null | head -1")
     assert (done.returncode, done.stderr) == (0, "")

@@ -127,7 +127,7 @@ def test_heights_beside_the_rig_become_its_part(configured: Callable[[str], Conf
         (
             "a.csv",
             b"1;2;3;4\n" * 3 + b"1;2;nan;4",
-            "scene[0].file: {path}: 1 heights are no numbers, the first one in row 4, column 3",
+            "{path}: 1 heights are no numbers, the first one in row 4, column 3",
         ),
         ("a.csv", b"1 " * 20_000, "scene[0].file: {path}: holds 20000 heights or more, expected at most 16384"),
         ("a.npy", b"no array", "scene[0].file: {path}: is no NumPy array"),
@@ -285,9 +285,8 @@ def test_a_point_off_the_axis_comes_back(
     table2: Camera, water: Media, rng: np.random.Generator, column_axis: str
 ) -> None:
     lattice = Lattice.regular(0.1, origin=(0.013, -0.021))
-    camera = replace(
-        table2, columns=900, rows=900, lattice=lattice, column_axis=column_axis, distortion_per_mm2=K1_PER_MM2
-    )
+    camera = replace(table2, columns=900, rows=900, lattice=lattice, column_axis=column_axis)
+    camera = replace(camera, distortion_per_mm2=K1_PER_MM2)
     true = (1.62, -1.13, 2.5)
     grid = Grid.centred((30, 30, 1), (0.05, 0.05, 0.1), true)
     assert scene_distortion(table2, water, grid) is None
@@ -312,11 +311,10 @@ def test_a_point_off_the_axis_comes_back(
 @pytest.mark.parametrize(("name", "radius"), [("pipe", 7.0), ("pipe_box", 13.0)])
 def test_the_camera_is_moved_from_a_pipes_board_to_its_axis_as_the_recipe_says(name: str, radius: float) -> None:
     """The recipe's figures, from a board on the outermost face or in the axis's place, are the scene's own."""
-    root = ROOT
-    settings = load_rig(root / "configs" / f"{name}.yaml")
+    settings = load_rig(ROOT / "configs" / f"{name}.yaml")
     space, camera = settings.scene_space(), settings.camera_model()
     assert space is not None
     to_face = space.shapes()[0].vertex_mm[2] - space.lens_z_mm(camera)
-    move, recipe = camera.focus_distance_mm - to_face, (root / "docs" / "curved-windows.md").read_text(encoding="utf-8")
+    move, recipe = camera.focus_distance_mm - to_face, (ROOT / "docs" / "curved-windows.md").read_text(encoding="utf-8")
     assert f"{move:.3f} mm" in recipe
     assert f"{move:.3f} − {radius:g} = −{radius - move:.3f} mm" in recipe

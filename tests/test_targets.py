@@ -6,7 +6,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from lfpiv_cli.arrays import Singles
+from lfpiv_cli.arrays import Floats, Singles
 from lfpiv_cli.calibration.board import another_kind, chessboard, dot_signal, locate_board, sentence
 from lfpiv_cli.calibration.board_pose import BoardGeometry, BoardPose, off_focus_mm, pose_of_dots, upright_numbers
 from lfpiv_cli.calibration.corners import quadrant_shares
@@ -23,6 +23,8 @@ from tests.known_rays import slopes_exact
 CHESS = BoardGeometry((4, 3), 0.8, 0.0, pattern="chessboard")
 CHARUCO = BoardGeometry((4, 3), 1.6, 0.0, pattern="charuco", marker_mm=1.2)
 DOTS = BoardGeometry((5, 4), 0.8, 0.3)
+WIDER, FEW_CHARUCO = replace(CHESS, dots=(5, 4)), replace(CHARUCO, dots=(3, 2))
+SMALL_CHARUCO = replace(CHARUCO, spacing_mm=0.8, marker_mm=0.6)
 PAPERS = Camera(-1.0, 100.0, 25.0, 0.8, 0.8, Lattice.regular(0.1), 0.0055, 2352, 1768)
 AIR = ObjectSpace(Media())
 LEVEL = 10_000.0
@@ -45,6 +47,11 @@ def picture(camera: Camera, board: BoardGeometry, placement: BoardPlacement) -> 
 @cache
 def at_one_mm(board: BoardGeometry) -> Singles:
     return picture(large(PAPERS) if board.pattern == "charuco" else small(PAPERS), board, BoardPlacement(1.0))
+
+
+def posed(dots: Floats, board: BoardGeometry) -> BoardPose:
+    """Return the pose of places that are known to a micrometre, before the paper's camera."""
+    return pose_of_dots(dots, np.full(dots.shape, 1e-3), -dots[:, :2], PAPERS, board)
 
 
 def agrees(pose: BoardPose, placement: BoardPlacement) -> None:
@@ -116,21 +123,9 @@ def test_numbers_grow_with_x_and_y_however_the_board_is_turned_and_markers_are_n
     [
         (CHESS, DOTS, "looks like a chessboard of 5 x 4 squares; board.pattern says dots"),
         (DOTS, CHESS, "looks like a board of 20 bright dots; board.pattern says chessboard"),
-        (
-            CHESS,
-            replace(CHESS, dots=(5, 4)),
-            "looks like a chessboard of 5 x 4 squares; the config says a chessboard of 6",
-        ),
-        (
-            CHESS,
-            replace(CHARUCO, spacing_mm=0.8, marker_mm=0.6),
-            "a chessboard of 5 x 4 squares; board.pattern says charuco",
-        ),
-        (
-            replace(CHARUCO, dots=(3, 2)),
-            DOTS,
-            "looks like a ChArUco board with markers of 4X4; board.pattern says dots",
-        ),
+        (CHESS, WIDER, "looks like a chessboard of 5 x 4 squares; the config says a chessboard of 6"),
+        (CHESS, SMALL_CHARUCO, "a chessboard of 5 x 4 squares; board.pattern says charuco"),
+        (FEW_CHARUCO, DOTS, "looks like a ChArUco board with markers of 4X4; board.pattern says dots"),
     ],
 )
 def test_another_target_is_named(table2: Camera, shown: BoardGeometry, said: BoardGeometry, expected: str) -> None:
@@ -155,21 +150,20 @@ def test_boards_that_are_none_are_refused(table2: Camera, rng: np.random.Generat
     board = BoardGeometry((9, 9), 1.0, 0.2)
     tracers = rng.uniform(-5.0, 5.0, (2000, 3))
     with pytest.raises(InputError, match="mm rms off a grid of 1 mm"):
-        pose_of_dots(tracers, np.full(tracers.shape, 1e-3), -tracers[:, :2], table2, board)
+        posed(tracers, board)
     i, j = np.divmod(np.arange(20), 5)
     dots = np.column_stack([0.8 * (j - 2.0), 0.8 * (i - 1.5), 2.0 + rng.normal(0.0, 0.5, 20)])
     with pytest.raises(InputError, match=r"lies 0\.\d+ mm rms in front of and behind one plane, at most 0\.16 mm"):
-        pose_of_dots(dots, np.full(dots.shape, 1e-3), -dots[:, :2], table2, DOTS)
+        posed(dots, DOTS)
     i, j = np.divmod(np.arange(81), 9)
     dots = np.column_stack([i - 4.0, j - 4.0, np.full(81, 2.0)])
-    assert pose_of_dots(dots[:41], np.full((41, 3), 1e-3), -dots[:41, :2], table2, board).dots_found == 41
+    assert posed(dots[:41], board).dots_found == 41
     with pytest.raises(InputError, match="only 40 of the board's 9 x 9 dots were found.* at least 41 are needed"):
-        pose_of_dots(dots[:40], np.full((40, 3), 1e-3), -dots[:40, :2], table2, board)
+        posed(dots[:40], board)
     camera = small(table2)
+    dark = np.zeros((camera.rows, camera.columns), np.float32)
     with pytest.raises(InputError, match="squares are 4 microlenses wide"):
-        locate_board(
-            np.zeros((camera.rows, camera.columns), np.float32), camera, replace(CHESS, spacing_mm=0.4), Media()
-        )
+        locate_board(dark, camera, replace(CHESS, spacing_mm=0.4), Media())
     # Near the focal plane they seem to lie in the middle of their lenses, a grid of 0.1 mm, and not on their own.
     lateral = 0.24 * np.column_stack([i - 4.0, j - 4.0])
     dots = np.column_stack([0.1 * np.rint(lateral / 0.1), rng.normal(0.0, 0.01, 81)])
@@ -178,7 +172,7 @@ def test_boards_that_are_none_are_refused(table2: Camera, rng: np.random.Generat
         (0.2, "check board"),
     ):
         with pytest.raises(InputError, match=f"mm rms off a grid of 0.24 mm, .* {words}"):
-            pose_of_dots(dots, np.full(dots.shape, 1e-3), -dots[:, :2], table2, BoardGeometry((9, 9), 0.24, wide))
+            posed(dots, BoardGeometry((9, 9), 0.24, wide))
 
 
 def test_a_dot_is_two_lenses_wide_where_boards_are_moved_to(table2: Camera, media: Media) -> None:
@@ -230,7 +224,7 @@ def test_particles_are_called_nothing_and_few_are_no_small_board(table2: Camera,
     for _ in range(40):
         tracers = rng.uniform(-1.0, 1.0, (25, 3)) * (1.6, 1.2, 0.8)
         with pytest.raises(InputError):
-            pose_of_dots(tracers, np.full(tracers.shape, 1e-3), -tracers[:, :2], table2, replace(DOTS, dots=(4, 3)))
+            posed(tracers, replace(DOTS, dots=(4, 3)))
 
 
 def test_auto_sees_whether_dots_are_bright_or_dark(rng: np.random.Generator) -> None:

@@ -63,8 +63,8 @@ def test_standard_errors_are_what_repetitions_scatter_by(rng: np.random.Generato
     assert 0.2 < np.std(off) < 1.4
     assert 0.2 < np.std(tilted) < 1.4
     once = between_walls(1500, rng)
-    twice = np.concatenate([once, once + (0.1, 0.05, 0.0)])
-    assert walls_of(twice, frames=2).middle_sigma_mm > 0.8 * walls_of(once).middle_sigma_mm
+    twice = walls_of(np.concatenate([once, once + (0.1, 0.05, 0.0)]), frames=2)
+    assert twice.middle_sigma_mm > 0.8 * walls_of(once).middle_sigma_mm
 
 
 def test_what_shows_no_wall_is_refused(rng: np.random.Generator) -> None:
@@ -77,13 +77,13 @@ def test_what_shows_no_wall_is_refused(rng: np.random.Generator) -> None:
         find_walls(between, np.full(500, 0.005), (-6.0, 3.6), WIDTH)
     own = seeded(3000, rng)
     error = np.full(len(own), 0.005)
-    with pytest.raises(InputError, match="only .* particles were found in the outer half"):
-        find_round_wall(own[:200], error[:200], 5.0, 5.4)
-    inner = np.hypot(own[:, 1], own[:, 2]) < 4.3
-    with pytest.raises(InputError, match="is all of the pipe seeded"):
-        find_round_wall(own[inner], error[inner], 5.0, 5.4)
-    with pytest.raises(InputError, match="further than this can mend"):
-        find_round_wall(own + (0.0, 0.0, 0.36), error, 5.0, 5.4)
+    for shown, words in (
+        (own[:200], "only .* particles were found in the outer half"),
+        (own[np.hypot(own[:, 1], own[:, 2]) < 4.3], "is all of the pipe seeded"),
+        (own + (0.0, 0.0, 0.36), "further than this can mend"),
+    ):
+        with pytest.raises(InputError, match=words):
+            find_round_wall(shown, error[: len(shown)], 5.0, 5.4)
 
 
 def test_the_picture_shows_all_particles_and_both_walls(rng: np.random.Generator) -> None:
@@ -184,9 +184,7 @@ def test_the_axis_is_found_within_its_errors(scene: MovableScene) -> None:
     assert np.abs(off).max() < 4.0
 
 
-def test_the_wall_of_a_pipe_is_found_and_no_tilt_of_a_short_piece(
-    rng: np.random.Generator,
-) -> None:
+def test_the_wall_of_a_pipe_is_found_and_no_tilt_of_a_short_piece(rng: np.random.Generator) -> None:
     own = seeded(3000, rng) + (0.0, 0.03, -0.04)
     own[:40, 1:] = rng.uniform(-5.4, 5.4, (40, 2))
     wall = find_round_wall(own, np.full(len(own), 0.005), 5.0, 5.4)
@@ -281,7 +279,6 @@ def test_what_is_told_and_shown_of_a_scene(scene: MovableScene, rng: np.random.G
     pytest.importorskip("matplotlib")
     from lfpiv_cli.pictures.calibration import round_wall_figure
 
-    found = refined(scene, rng, TRUTH)
     section, around, along, counted = round_wall_figure(found).axes
     assert f"{len(found.position_mm)} of 3000 particles" in section.get_title()
     wall = around.lines[1].get_ydata()

@@ -32,8 +32,7 @@ def small(table2: Camera) -> Camera:
 
 
 def weights_of(camera: Camera, media: Media, grid: Grid, padding: tuple[int, int, int] = (0, 0, 0)) -> Weights:
-    operator = factorise(camera, media, grid.padded(padding))
-    return Weights(grid, padding, operator, camera.column_axis)
+    return Weights(grid, padding, factorise(camera, media, grid.padded(padding)), camera.column_axis)
 
 
 def ray_count(
@@ -80,12 +79,8 @@ def test_forward_and_adjoint_are_adjoint(small, media, rng, column_axis, padding
 
 @pytest.mark.parametrize("column_axis", ["x", "y"])
 def test_a_part_is_what_the_whole_does_there(small, water, rng, column_axis):
-    whole = weights_of(
-        replace(small, column_axis=column_axis),
-        water,
-        Grid.centred((9, 7, 4), (0.1, 0.12, 0.4), (0.1, 0.2, 0.3)),
-        (1, 2, 0),
-    )
+    grid = Grid.centred((9, 7, 4), (0.1, 0.12, 0.4), (0.1, 0.2, 0.3))
+    whole = weights_of(replace(small, column_axis=column_axis), water, grid, (1, 2, 0))
     middle, reach = np.array([0.35, 0.05]), 0.21
     part = whole.around(middle, reach)
     centres = part.grid.centres_mm()
@@ -116,16 +111,7 @@ def test_kernels_equal_dense_products(small, water, rng, shape):
     np.testing.assert_allclose(operator.adjoint(image), adjoint_reference(operator, image), rtol=1e-5, atol=1e-6)
 
 
-def test_bits_do_not_depend_on_threads_nor_light(
-    small: Camera, water: Media, rng: np.random.Generator, one_thread
-) -> None:
-    operator = factorise(small, water, Grid.centred((9, 8, 7), (0.1, 0.1, 0.5), (0.0, 0.0, 0.0)))
-    volume = rng.random(operator.shape, dtype=np.float32)
-    with one_thread():
-        image = operator.forward(volume)
-        back = operator.adjoint(image)
-    assert np.array_equal(image, operator.forward(volume))
-    assert np.array_equal(back, operator.adjoint(image))
+def test_a_voxel_lights_its_column_and_shares_are_whole(small: Camera, water: Media) -> None:
     weights = weights_of(small, water, Grid.centred((4, 3, 2), (0.1, 0.1, 0.1), (0.0, 0.0, -2.0)), (1, 2, 1))
     volume = np.zeros(weights.shape, np.float32)
     volume[1, 2, 3] = 1.0
@@ -178,15 +164,6 @@ def test_what_weights_are_made_of(table2, water, small):
         assert disc_area_below(a, b, 1.0) == pytest.approx(counted, abs=4.0 / n)  # one line of cells at each edge
 
 
-def test_direct_ray_tracing_gives_the_weights_of_equivalent_points_eqs_14_15(small, water, window):
-    grid = Grid.centred((3, 2, 4), (0.1, 0.1, 0.5), (0.2, 0.1, 1.0))
-    direct = factorise_through(small, ObjectSpace(water, window, "paraxial", "drt"), grid)
-    equivalent = factorise(small, water, grid)
-    for one, other in ((direct.columns, equivalent.columns), (direct.rows, equivalent.rows)):
-        np.testing.assert_array_equal(one.cell, other.cell)
-        np.testing.assert_allclose(one.share, other.share, atol=2e-7)  # float32 rounding
-
-
 @pytest.mark.parametrize("z_mm", [-2.0, 3.0])
 def test_exact_refraction_comes_closer_to_exact_rays(small, water, window, z_mm):
     # 134 mm of water: the paraxial columns are off by 0.05 in L1, the separable exact ones by 0.02.
@@ -234,9 +211,8 @@ def test_quadrature_agrees_with_counted_rays_eq_13(
 
 def test_halving_the_tiles_converges_in_second_order_and_no_light_is_lost(layout, water, window):
     camera = small_camera(layout)
-    images = [
-        quadrature_image(camera, ObjectSpace(water, None, "paraxial"), (0.2, 0.1, 2.0), tiles=n) for n in (32, 64, 128)
-    ]
+    paraxial = ObjectSpace(water, None, "paraxial")
+    images = [quadrature_image(camera, paraxial, (0.2, 0.1, 2.0), tiles=n) for n in (32, 64, 128)]
     coarse, fine = (np.abs(a - b).sum() for a, b in zip(images, images[1:], strict=False))
     assert fine < 0.4 * coarse
     assert fine < 0.005
@@ -251,20 +227,14 @@ def test_voxels_that_have_no_column_and_counted_rays_that_repeat(table2, water):
     space = ObjectSpace(water, Window(198.0, 2.0))
     with pytest.raises(ConfigError, match="in front of the fluid"):
         integrate_columns(table2, space, [(0.0, 0.0, -5.0)], VOXEL)
-    columns = integrate_columns(small_camera("square"), ObjectSpace(water, None, "paraxial"), [(9.0, 0.0, 0.0)], VOXEL)
-    assert columns.share.size == 0
-    camera = small_camera("square")
-    images = [
-        count_rays(camera, ObjectSpace(Media()), (0.1, 0.0, 1.0), VOXEL, np.random.default_rng(3), RayCount(50, 40))
-        for _ in range(2)
-    ]
+    camera, space = small_camera("square"), ObjectSpace(water, None, "paraxial")
+    assert integrate_columns(camera, space, [(9.0, 0.0, 0.0)], VOXEL).share.size == 0
+    count = (camera, ObjectSpace(Media()), (0.1, 0.0, 1.0), VOXEL)
+    images = [count_rays(*count, np.random.default_rng(3), RayCount(50, 40)) for _ in range(2)]
     assert np.array_equal(*images)
     assert images[0].sum() == pytest.approx(1.0)
-    space = ObjectSpace(water, None, "paraxial")
-    images = [
-        quadrature_image(c, space, (0.2, -0.1, 1.0), tiles=16) for c in (camera, replace(camera, column_axis="y"))
-    ]
-    assert np.array_equal(*images)
+    turned = (camera, replace(camera, column_axis="y"))
+    assert np.array_equal(*(quadrature_image(each, space, (0.2, -0.1, 1.0), tiles=16) for each in turned))
 
 
 def test_tiles_fill_the_disc_and_polynomials_are_their_array_twins(water, rng):
@@ -278,10 +248,8 @@ def test_tiles_fill_the_disc_and_polynomials_are_their_array_twins(water, rng):
     fitted = PolynomialRays(np.array([4.0, 3.0, 8.0, 12.0, 11.0]), exponents, rng.normal(size=(len(exponents), 2)))
     points, crossings = rng.uniform(-4.0, 4.0, (50, 3)), rng.uniform(-12.0, 12.0, (50, 2))
     scene = kernel_scene(small_camera("square"), fitted, points, np.array(VOXEL), 4, 1)
-    kernel = [
-        on_array(scene, point, rays_from(scene, point, 0, 0), *crossing)
-        for point, crossing in zip(points, crossings, strict=True)
-    ]
+    pairs = zip(points, crossings, strict=True)
+    kernel = [on_array(scene, point, rays_from(scene, point, 0, 0), *crossing) for point, crossing in pairs]
     np.testing.assert_allclose(kernel, fitted.on_array(points, crossings), rtol=1e-12, atol=1e-12)
     assert fit_vignetting(np.zeros((60, 60), np.float32), Lattice.regular(18.0)) is None
 
@@ -291,9 +259,7 @@ def test_lens_regions_share_out_a_rectangle(layout, rng):
     low, high = np.array([-0.13, 0.02]), np.array([0.11, 0.09])
     work = np.empty((2, MOST_CORNERS, 2))
     centres = lattice.points([(i, j) for i in range(-4, 5) for j in range(-4, 5)])
-    parts = [
-        shared_rectangle((low[0], low[1]), (high[0], high[1]), x, y, neighbours(lattice), work) for x, y in centres
-    ]
+    parts = [shared_rectangle(tuple(low), tuple(high), x, y, neighbours(lattice), work) for x, y in centres]
     area = float(np.prod(high - low))
     assert sum(part[0] for part in parts) == pytest.approx(area, rel=1e-12)
     points = low + rng.random((20_000, 2)) * (high - low)
