@@ -80,9 +80,7 @@ def write_cine(
     path.write_bytes(b"".join([header, bitmap, setup, blocks, struct.pack(f"<{count}{kind}", *places), *wrapped]))
 
 
-def write_seq(
-    path: Path, stack: np.ndarray, *, version: int = 5, used: int = 0, kind: int = 100, compression: int = 0
-) -> None:
+def write_seq(path: Path, stack: np.ndarray, *, version: int = 5) -> None:
     """Write a Norpix sequence of frames (frame, row, column) of 8 or 16 bits."""
     count, rows, columns = stack.shape
     bits, frame_bytes = 8 * stack.dtype.itemsize, stack[0].nbytes
@@ -90,9 +88,8 @@ def write_seq(
     step = -(-(frame_bytes + 8) // 512) * 512
     header = bytearray(size)
     header[:36] = struct.pack("<I24sii", 0xFEED, "Norpix seq\n".encode("utf-16-le"), version, 1024)
-    header[548:584] = struct.pack("<9I", columns, rows, bits, used or bits, frame_bytes, kind, count, 0, step)
+    header[548:584] = struct.pack("<9I", columns, rows, bits, bits, frame_bytes, 100, count, 0, step)
     header[584:592] = struct.pack("<d", RATE_HZ)
-    header[620:624] = struct.pack("<I", compression)
     body = b""
     for k, frame in enumerate(stack):
         micro = k * STEP_US
@@ -101,7 +98,7 @@ def write_seq(
     path.write_bytes(bytes(header) + body)
 
 
-def write_mraw(path: Path, stack: np.ndarray, *, bits: int, xml: bool = True, colour: str = "Mono") -> None:
+def write_mraw(path: Path, stack: np.ndarray, *, bits: int, xml: bool = True) -> None:
     """Write a Photron recording of frames (frame, row, column) of 8 or 16 bits, or packed to 10 or 12; its header."""
     count, rows, columns = stack.shape
     frames = [frame.tobytes() if bits in (8, 16) else bits_high_first(frame, bits) for frame in stack]
@@ -118,7 +115,7 @@ def write_mraw(path: Path, stack: np.ndarray, *, bits: int, xml: bool = True, co
 <imageFileInfo><fileFormat>MRaw</fileFormat></imageFileInfo>
 <imageDataInfo><resolution><width>{columns}</width><height>{rows}</height></resolution>
 <effectiveBit><depth>{bits}</depth><side>Lower</side></effectiveBit>
-<colorInfo><type>{colour}</type><bit>{bits}</bit></colorInfo></imageDataInfo></cih>
+<colorInfo><type>Mono</type><bit>{bits}</bit></colorInfo></imageDataInfo></cih>
 """.encode()
             + b"\0\0"
         )
@@ -126,7 +123,7 @@ def write_mraw(path: Path, stack: np.ndarray, *, bits: int, xml: bool = True, co
         path.with_suffix(".cih").write_text(
             "#Camera Information Header\nDate : 2026/1/1\n"
             f"Record Rate(fps) : {RATE_HZ}\nTotal Frame : {count}\nOriginal Total Frame : {count}\n"
-            f"Image Width : {columns}\nImage Height : {rows}\nColor Type : {colour}\nColor Bit : {bits}\n"
+            f"Image Width : {columns}\nImage Height : {rows}\nColor Type : Mono\nColor Bit : {bits}\n"
             f"File Format : MRaw\nEffectiveBit Depth : {bits}\nEffectiveBit Side : Lower\n"
         )
 

@@ -62,39 +62,6 @@ def test_values_that_are_no_numbers_are_refused(path: Path) -> None:
         read_points(path, PARTICLES_FORMAT)
 
 
-@pytest.fixture
-def tracks() -> Points:
-    """Three tracks in four frames, by track: through all, from the second on, and in the last two; none in a fifth."""
-    track = np.array([0, 0, 0, 0, 1, 1, 1, 2, 2])
-    frame = np.array([0, 1, 2, 3, 1, 2, 3, 2, 3])
-    position = np.column_stack([track, frame, 0.5 * track + frame]).astype(np.float64)
-    velocity = np.column_stack([10.0 * track + frame, np.zeros(9), np.ones(9)])
-    arrays = {"track": track, "frame": frame, "velocity": velocity, "velocity_sigma": 0.1 * np.ones((9, 3))}
-    return Points(position, arrays, Reference("mid_plane", 0.5), {}, {"command": "follow"})
-
-
-def test_vtk_plays_the_places_of_each_frame(tracks: Points, tmp_path: Path) -> None:
-    write_playback(tmp_path / "playback.vtkhdf", tracks, 5, 0.002, overwrite=False)
-    with pytest.raises(OutputExistsError):
-        write_playback(tmp_path / "playback.vtkhdf", tracks, 4, 0.002, overwrite=False)
-    reader = vtk_opened(tmp_path / "playback.vtkhdf")
-    from vtkmodules.util.numpy_support import vtk_to_numpy
-
-    assert reader.GetNumberOfSteps() == 5
-    for step in range(5):
-        reader.SetStep(step)
-        reader.Update()
-        assert reader.GetTimeValue() == pytest.approx(0.002 * step)
-        shown, here = reader.GetOutput(), tracks.arrays["frame"] == step
-        assert shown.GetNumberOfPoints() == shown.GetNumberOfVerts() == here.sum()
-        if here.any():
-            np.testing.assert_array_equal(vtk_to_numpy(shown.GetPoints().GetData()), tracks.position_mm[here])
-            assert shown.GetPointData().GetVectors().GetName() == "velocity"
-            for name in ("track", "velocity"):
-                stored = vtk_to_numpy(shown.GetPointData().GetArray(name))
-                np.testing.assert_array_equal(stored, tracks.arrays[name][here])
-
-
 FRAMES, TRACKS = 9, 40
 
 
@@ -110,6 +77,28 @@ def many_tracks(rng: np.random.Generator) -> Points:
     arrays = {"velocity": rng.random((n, 3)), "velocity_sigma": rng.random((n, 3)), "track": track, "frame": frame}
     arrays |= {"particle": rng.integers(0, 99, n), "link_probability": probability}
     return Points(rng.random((n, 3)), arrays, REFERENCE, {"dt_s": 0.1}, {"command": "follow"})
+
+
+def test_vtk_plays_the_places_of_each_frame(many_tracks: Points, tmp_path: Path) -> None:
+    write_playback(tmp_path / "playback.vtkhdf", many_tracks, FRAMES, 0.002, overwrite=False)
+    with pytest.raises(OutputExistsError):
+        write_playback(tmp_path / "playback.vtkhdf", many_tracks, 4, 0.002, overwrite=False)
+    reader = vtk_opened(tmp_path / "playback.vtkhdf")
+    from vtkmodules.util.numpy_support import vtk_to_numpy
+
+    assert reader.GetNumberOfSteps() == FRAMES
+    for step in range(FRAMES):
+        reader.SetStep(step)
+        reader.Update()
+        assert reader.GetTimeValue() == pytest.approx(0.002 * step)
+        shown, here = reader.GetOutput(), many_tracks.arrays["frame"] == step
+        assert shown.GetNumberOfPoints() == shown.GetNumberOfVerts() == here.sum()
+        if here.any():
+            np.testing.assert_array_equal(vtk_to_numpy(shown.GetPoints().GetData()), many_tracks.position_mm[here])
+            assert shown.GetPointData().GetVectors().GetName() == "velocity"
+            for name in ("track", "velocity"):
+                stored = vtk_to_numpy(shown.GetPointData().GetArray(name))
+                np.testing.assert_array_equal(stored, many_tracks.arrays[name][here])
 
 
 def put(folder: Path, many_tracks: Points) -> StoredTracks:

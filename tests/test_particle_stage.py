@@ -16,14 +16,7 @@ from lfpiv_cli.errors import InputError, OutputExistsError, PartialError, UsageE
 from lfpiv_cli.files import particle_file, vtkhdf
 from lfpiv_cli.files.config import carried_config, load_rig
 from lfpiv_cli.files.images import read_image
-from lfpiv_cli.files.particle_file import (
-    PARTICLES_FORMAT,
-    TRACKS_FORMAT,
-    TRAJECTORIES_FORMAT,
-    Points,
-    read_particles,
-    read_points,
-)
+from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, TRACKS_FORMAT, TRAJECTORIES_FORMAT, Points, read_points
 from lfpiv_cli.files.vtkhdf import open_vectors
 from lfpiv_cli.grid import Reference
 from lfpiv_cli.validation.volume import particle_figures
@@ -220,7 +213,7 @@ def test_the_sample_from_images_to_vectors(tmp_path: Path) -> None:
     assert attributes["residual_rms_counts"] == pytest.approx(rms, rel=1e-5)
     run("track", *frames, "-o", tmp_path / "tracks.vtkhdf", "--grid")
 
-    truth = read_particles(SAMPLE / "particles.npz")
+    truth = particle_file.read_particles(SAMPLE / "particles.npz")
     first = read_points(frames[0], PARTICLES_FORMAT)
     start = truth.positions_mm - truth.velocities_m_s * 1e3 * 0.5 * 0.002
     start = first.reference.points_from_focal_point(start)
@@ -393,7 +386,7 @@ def test_a_recorded_pair(data_folder: Path, tmp_path: Path) -> None:
     vectors = vectors_of(CONFIG.parent / "channel.yaml", data, tmp_path)
     # What particles reached when this was written.
     found = read_points(tmp_path / "particles" / "pair_a.vtkhdf", PARTICLES_FORMAT)
-    true = read_particles(data / "particles.npz")
+    true = particle_file.read_particles(data / "particles.npz")
     places = found.reference.points_to_focal_point(found.position_mm)
     moved = true.positions_mm + true.velocities_m_s * 1e3 * -0.0009
     low, high = np.array([-6.5, -5.0, -5.46]), np.array([6.5, 5.0, 4.53])

@@ -19,7 +19,7 @@ from lfpiv_cli.pictures import style
 from lfpiv_cli.pictures import vectors as of_volume
 from lfpiv_cli.pictures import vectors as pictures
 from lfpiv_cli.pictures.points import convergence_figure
-from lfpiv_cli.pictures.style import COLOURS, MARKERS, SETTINGS, SLABS, percentiles_by_depth, scale_of, symmetric_limit
+from lfpiv_cli.pictures.style import COLOURS, MARKERS, SETTINGS, percentiles_by_depth, scale_of, symmetric_limit
 from lfpiv_cli.verbs.plot import figures_of
 from tests.commands import CONFIG
 from tests.known_rays import tube_of
@@ -69,7 +69,7 @@ def test_particles_and_what_they_leave() -> None:
     light = np.array([1.0, 2.0, 3.0, 100.0, 10.0, 20.0, 30.0, 40.0])
     covariance = np.tile([1e-6, 4e-6, 1e-4, 0.0, 0.0, 0.0], (8, 1))
     counts, lights, sigmas = of_points.depths_figure(z, light, covariance).axes
-    assert [bar.get_height() for bar in counts.patches] == [4.0] + [0.0] * (SLABS - 2) + [4.0]
+    assert [bar.get_height() for bar in counts.patches] == [4.0] + [0.0] * 18 + [4.0]
     np.testing.assert_allclose(lights.lines[0].get_ydata()[[0, -1]], [2.5, 25.0])
     last = [line.get_ydata()[-1] for line in sigmas.lines]
     np.testing.assert_allclose(last, [1e-3, 2e-3, 1e-2])
@@ -77,7 +77,7 @@ def test_particles_and_what_they_leave() -> None:
     places, medians = percentiles_by_depth(np.array([0.0, 0.1, 0.2, 20.0]), np.array([1.0, np.nan, 3.0, 9.0]), 50.0)
     assert np.isnan(medians).all()
     np.testing.assert_allclose(places[[0, -1]], [0.5, 19.5])
-    assert percentiles_by_depth(np.full(3, 2.0), np.array([1.0, 2.0, 3.0]), 50.0)[1][SLABS // 2] == 2.0
+    assert percentiles_by_depth(np.full(3, 2.0), np.array([1.0, 2.0, 3.0]), 50.0)[1][10] == 2.0
     axes = of_points.chi2_figure(np.array([0.9, 1.1, 70.0, 80.0])).axes[0]
     assert axes.patches[-1].get_height() == 2.0
     assert axes.get_title() == "median 35.55, 2 beyond 5"

@@ -8,14 +8,14 @@ from scipy.interpolate import BSpline
 
 from lfpiv_cli.arrays import Floats, Integers
 from lfpiv_cli.fields import stencils
-from lfpiv_cli.fields.fit import FEW_SAMPLES, Field, fit_field
+from lfpiv_cli.fields.fit import Field, fit_field
 from lfpiv_cli.fields.spline_field import SplineField, first_expectation, lattice_for, most_probable
 from lfpiv_cli.fields.stencils import DIVERGENCE, SECOND, SECOND_IN_DEPTH, SMOOTHNESS, Expectation, Lattice, bound
 from lfpiv_cli.fields.structure import Samples, belonging, with_places, without_itself
 
 LATTICE = Lattice((-1.0, 0.5, 2.0), (0.5, 0.7, 0.6), (4, 2, 1))
 # So many samples are fitted by splines, not kriged.
-MANY = FEW_SAMPLES + 20
+MANY = 620
 LOW, HIGH = np.array([-2.0, -2.0, -2.0]), np.array([2.0, 2.0, 2.0])
 
 

@@ -16,12 +16,11 @@ from benchmarks.volumes import Seeding, volume_pair
 from lfpiv_cli.console import Console
 from lfpiv_cli.errors import InputError, PartialError, UsageError
 from lfpiv_cli.fields.structure import Samples
-from lfpiv_cli.files import vtkhdf
 from lfpiv_cli.files.config import Config, load_rig
 from lfpiv_cli.files.particle_file import TRACKS_FORMAT, TRAJECTORIES_FORMAT, open_tracks, write_points
 from lfpiv_cli.files.provenance import record
 from lfpiv_cli.files.vtkhdf import open_vectors, read_header, write_volume
-from lfpiv_cli.flow.correlation import SMALLEST_VALID_FRACTION, correlate
+from lfpiv_cli.flow.correlation import correlate
 from lfpiv_cli.flow.field import MASKED
 from lfpiv_cli.flow.windows import CorrelationSettings, RoundWall, WindowLayout, layout_windows
 from lfpiv_cli.grid import Grid, Reference
@@ -29,7 +28,7 @@ from lfpiv_cli.synthetic.flows import pipe
 from lfpiv_cli.verbs import checks
 from lfpiv_cli.verbs.checks import Quality, calibration_notices, field_notices, pair_notices, tracers_per_window
 from lfpiv_cli.verbs.field import FieldOptions, fit_flow, read_places
-from lfpiv_cli.verbs.fields import LARGEST_CHI2, fit_notices, fitted, samples_of_tracks
+from lfpiv_cli.verbs.fields import fit_notices, fitted, samples_of_tracks
 from tests.commands import CONFIG, run, sample_rig, told
 from tests.test_particle_stage import HIGH, LOW, write_frames
 from tests.vector_fields import pair_tracks, points_of
@@ -233,12 +232,12 @@ def write_tracks(
     """Write tracks, with errors as stated, of a flow that is added to what moves as a whole."""
     sigma, dt_s = np.array([1e-3, 1e-3, 1e-2]), 2e-3
     place = rng.uniform(LOW, HIGH, (count, 3))
-    moved = MOVED_MM + flow(place) + sigma * rng.standard_normal((count, 3))
+    displaced = MOVED_MM + flow(place) + sigma * rng.standard_normal((count, 3))
     settings = load_rig(CONFIG).overridden("correlation", dt_s=dt_s)
     for section, keys in (changes or {}).items():
         settings = settings.overridden(section, **keys)
     dt_s = float(settings.correlation.dt_s or dt_s)
-    points = pair_tracks(place, moved, sigma, dt_s, {"config": settings.resolved()}, Reference("mid_plane", 0.5))
+    points = pair_tracks(place, displaced, sigma, dt_s, {"config": settings.resolved()}, Reference("mid_plane", 0.5))
     if not full:
         del points.arrays["displacement_covariance_mm2"]
     write_points(path, TRACKS_FORMAT, points, overwrite=True)
@@ -276,7 +275,7 @@ def test_the_fluid_stands_still_at_a_pipes_wall(rng: np.random.Generator, no_sli
     assert largest < 0.02 if no_slip else largest > 0.03
     field = found.vectors()
     away = wall.shares(field.grid.centres_mm(), np.full(3, 0.8))
-    np.testing.assert_array_equal(field.flag == MASKED, away < SMALLEST_VALID_FRACTION)
+    np.testing.assert_array_equal(field.flag == MASKED, away < 0.25)
     assert 0 < np.sum(field.flag == MASKED) < field.flag.size
 
 
@@ -284,7 +283,7 @@ def test_the_fluid_stands_still_at_a_pipes_wall(rng: np.random.Generator, no_sli
 @pytest.mark.parametrize("full", [True, False])
 def test_field_has_the_flow_of_its_tracks(tmp_path: Path, fitted_by: Callable[..., dict[str, Any]], full: bool) -> None:
     assert fitted_by(full=full)["samples"] == 100
-    field = vtkhdf.open_vectors(tmp_path / "field.vtkhdf")
+    field = open_vectors(tmp_path / "field.vtkhdf")
     found = field.displacement_voxel[field.flag == 0] * field.voxel_mm
     np.testing.assert_allclose(found.mean(axis=0), MOVED_MM, atol=3e-3)
     assert field.uncertainty_voxel is not None
@@ -313,7 +312,7 @@ def test_what_is_known_of_the_divergence_is_chosen(fitted_by: Callable[..., dict
     # the divergence is three times each of three gradients, and their rms counts six that are none
     assert share < 0.05 if divergence == "free" else share == pytest.approx(3.0 * np.sqrt(3.0), rel=0.05)
     if divergence == "free":
-        assert summary["reduced_chi2"] > LARGEST_CHI2
+        assert summary["reduced_chi2"] > 2.0
 
 
 def test_few_tracks_make_no_field_pairs_no_frames_and_no_pressure(tmp_path: Path, rng: np.random.Generator) -> None:
@@ -403,6 +402,6 @@ def test_the_grid_of_track_by_splines_is_the_field_of_its_tracks(tmp_path: Path,
     pair = write_frames(tmp_path, rng.uniform(LOW, HIGH, (80, 3)), MOVED_MM + 1e-4 * rng.standard_normal((80, 3)))
     run("track", *pair, "--grid", "--by", "spline", "--dt-s", "0.002", "-o", tmp_path / "tracks.vtkhdf", "-q")
     run("field", tmp_path / "tracks.vtkhdf", "-o", tmp_path / "field.vtkhdf", "-q")
-    grids = [vtkhdf.open_vectors(tmp_path / name) for name in ("tracks_grid.vtkhdf", "field.vtkhdf")]
+    grids = [open_vectors(tmp_path / name) for name in ("tracks_grid.vtkhdf", "field.vtkhdf")]
     np.testing.assert_array_equal(grids[0].displacement_voxel, grids[1].displacement_voxel)
     assert np.isfinite(grids[0].displacement_voxel).any()

@@ -20,7 +20,7 @@ from lfpiv_cli.validation import weights
 from lfpiv_cli.validation.board import DEPTH_DEFINITIONS, board_figures, elongation_mm, gaussian_centre_mm, measure_dots
 from lfpiv_cli.validation.flow import limits_missed
 from lfpiv_cli.validation.volume import known_volume, match, normalised_correlation, particle_figures, volume_figures
-from lfpiv_cli.validation.weights import GREY_LEVELS, WINDOW_RADIUS_PX, Column, make_columns, ssim, weights_figures
+from lfpiv_cli.validation.weights import Column, make_columns, ssim, weights_figures
 from tests.commands import CONFIG, changed, run, table2_rig
 
 BOARD_GRID = Grid.centred((30, 20, 60), (0.1, 0.1, 0.1), (0.0, 0.0, 0.0))
@@ -225,10 +225,10 @@ VOXEL, CENTRES = Grid((1, 1, 1), (0.1,) * 3, (0.3, -0.2, 3.0)), np.array([(0.3, 
 
 def test_ssim_eq_16_and_figures_of_a_column_by_hand(rng):
     # Constant images have no variance: only the means are left, (2 a b + c1) / (a^2 + b^2 + c1) with c1 = 2.55^2.
-    size = 4 * WINDOW_RADIUS_PX + 1
+    size = 21
     a, b = np.full((size, size), 100.0), np.full((size, size), 150.0)
-    border = WINDOW_RADIUS_PX
-    c1 = (0.01 * GREY_LEVELS) ** 2
+    border = 5
+    c1 = 2.55**2
     expected = (2 * 100 * 150 + c1) / (100**2 + 150**2 + c1)
     middle = np.pad(a, border), np.pad(b, border)  # zeros around: windows at the edge see them, the middle does not
     assert ssim(a, a) == pytest.approx(1.0)
