@@ -11,12 +11,10 @@ import pytest
 import lfpiv_cli as lf
 from lfpiv_cli.arrays import Floats
 from lfpiv_cli.errors import InputError, OutputExistsError, PartialError, StoppedEarlyError, UsageError
-from lfpiv_cli.files.batch import Frame
 from lfpiv_cli.files.images import write_tiff
 from lfpiv_cli.files.inputs import Deadline
 from lfpiv_cli.files.particle_file import TRAJECTORIES_FORMAT, Points, read_points
 from lfpiv_cli.particles.view import raw_view
-from lfpiv_cli.verbs import follow as stage
 from tests.commands import contents, run, sample_weights
 from tests.particle_images import light_on
 
@@ -166,20 +164,21 @@ def test_both_ways_keep_what_was_found_forwards(rig: Path, followed: Path, tmp_p
 
 @pytest.mark.thorough
 def test_tracks_end_before_a_frame_that_is_lost(rig: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    names = [tmp_path / f"t_{number}.tif" for number in (8, 9, 10, 11, 13)]
-    for path, source in zip(names, [0, 1, 2, None, 3], strict=True):
+    # It begins with the first two that can be read.
+    names = [tmp_path / f"t_{number}.tif" for number in (7, 8, 9, 10, 11, 13)]
+    for path, source in zip(names, [None, 0, 1, 2, None, 3], strict=True):
         path.write_bytes(b"II" if source is None else images(rig)[source].read_bytes())
     output, failures = tmp_path / "out", tmp_path / "failures.json"
     options = ("--shortest", 2, "--keep-going", "--failures", failures)
-    with pytest.raises(InputError, match="t_11"):
+    with pytest.raises(InputError, match="t_7"):
         follow(rig, output, frames=names)
     # As a shell sorts them.
     capsys.readouterr()
-    with pytest.raises(PartialError, match="1 of 5 frames failed"):
+    with pytest.raises(PartialError, match="2 of 6 frames failed"):
         follow(rig, output, *options, frames=sorted(names))
     told = capsys.readouterr().err
     assert all(code in told for code in ("frames-reordered", "frames-missing", "frame-failed"))
-    assert [each["name"] for each in json.loads(failures.read_text())] == ["t_11"]
+    assert [each["name"] for each in json.loads(failures.read_text())] == ["t_7", "t_11"]
     assert sorted(path.stem for path in (output / "particles").iterdir()) == ["t_10", "t_13", "t_8", "t_9"]
     tracks = tracks_of(output)
     assert tracks.arrays["frame"].tolist() == COUNT * [0, 1, 2]
@@ -189,18 +188,6 @@ def test_tracks_end_before_a_frame_that_is_lost(rig: Path, tmp_path: Path, capsy
     with pytest.raises(PartialError):
         follow(rig, output, *options, "--resume", frames=names)
     assert {path: path.stat().st_mtime_ns for path in before} == before
-
-
-def test_a_sequence_begins_with_two_frames_that_can_be_read(tmp_path: Path) -> None:
-    paths = [tmp_path / f"{number}.tif" for number in range(5)]
-    for number, path in enumerate(paths):
-        if number not in (1, 4):
-            write_tiff(path, np.arange(6, dtype=np.uint16).reshape(2, 3), overwrite=True)
-    write_tiff(paths[4], np.ones((2, 3), np.uint16), overwrite=True)
-    frames, left_out = stage._readable([Frame(path, 0, 1) for path in paths], (2, 3))
-    assert [(frame.stem, frame.fault is None) for frame in frames] == [("2", True), ("3", True), ("4", False)]
-    assert [each.name for each in left_out] == ["0", "1", "4"]
-    assert "one value everywhere" in left_out[2].error
 
 
 @pytest.mark.thorough

@@ -38,23 +38,20 @@ def choices(annotation: Any) -> tuple[str, ...]:
     return tuple(name for inner in get_args(annotation) for name in choices(inner))
 
 
-def keys_with_names() -> Iterator[tuple[tuple[str, ...], type[Section], tuple[str, ...]]]:
-    """Yield every key of the configuration whose values are names: its path, its section and the names."""
+def keys() -> Iterator[tuple[tuple[str, ...], type[Section], tuple[str, ...]]]:
+    """Yield every key of the configuration: its path, its section and the names that it may have."""
     sections: list[tuple[tuple[str, ...], type[Section]]] = [((), Sections)]
     for path, section in sections:
         for name, field in section.model_fields.items():
             sections += [((*path, name), inner) for inner in sections_in(field.annotation)]
             # Single letters are axes.
-            if names := tuple(n for n in choices(field.annotation) if len(n) > 2):
-                yield (*path, name), section, names
+            yield (*path, name), section, tuple(n for n in choices(field.annotation) if len(n) > 2)
 
 
 def sections_in(annotation: Any) -> list[type[Section]]:
-    """Return the sections that a type holds, but for the kinds of flows, which share their keys."""
-    if annotation is FlowSection or get_origin(annotation) is Literal:
-        return []
+    """Return the sections that a type holds."""
     if isinstance(annotation, type) and issubclass(annotation, Section):
-        return [annotation] if "kind" not in annotation.model_fields else []
+        return [annotation]
     return [section for inner in get_args(annotation) for section in sections_in(inner)]
 
 
@@ -97,7 +94,13 @@ def commands() -> Iterator[tuple[str, click.Command]]:
         yield name, command
 
 
-KEYS = list(keys_with_names())
+# Of the kinds of flows and of faces, which share their keys, the kind is not among them.
+KEYS = [(path, section, names) for path, section, names in keys() if names and "kind" not in section.model_fields]
+
+
+def test_every_key_is_explained() -> None:
+    for path, section, _ in keys():
+        assert re.search(rf"\b{path[-1]}\b", TABLE2.read_text() + (section.__doc__ or "")), path
 
 
 def test_flows_and_keys_are_those_of_the_registry() -> None:
