@@ -31,7 +31,7 @@ IMAGES = {"white image", "dark image", "board image", "frame", "residual image"}
 CALIBRATIONS = {"calibration", "fitted rays", "refined calibration"}
 WEIGHTS = {"weights", "weights without calibration", "weights on demand", "counted weights", "weights in strips"}
 VECTORS = {
-    *("vectors", "mean vectors", "statistics", "tracks on a grid", "combined vectors", "field", "field with pressure"),
+    *("vectors", "mean vectors", "statistics", "tracks on a grid", "combined vectors", "field", "field with pressure")
 }
 PARTICLES = {"particles", "followed particles"}
 SEQUENCES = {"tracks of a sequence", "followed tracks"}

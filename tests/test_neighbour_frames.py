@@ -106,9 +106,7 @@ def test_what_fits_and_finds_its_light_is_beyond_doubt(table2: Camera, water: Me
 
 
 @pytest.mark.thorough
-def test_particles_are_expected_where_the_flow_takes_them(
-    rng: np.random.Generator,
-) -> None:
+def test_particles_are_expected_where_the_flow_takes_them(rng: np.random.Generator) -> None:
     trusted = strewn(rng, 60)
     # Half of them are seen already, all of them brighter, and none of the rest is anywhere near.
     seen = (trusted[:30] + MOVED) * (1.0, 1.0, 1.0, 1.2)
