@@ -119,11 +119,13 @@ class Sizes(NamedTuple):
     square : (n,) squared diameters in microlenses, below 0 where noise makes an image sharper than a point's
     sigma : (n,) their standard errors
     forms : (m,) what tracers show of size and diffusion together, by waves
+    candidates : among how many tracers those that show it were sought
     """
 
     square: NDArray[np.float64]
     sigma: NDArray[np.float64]
     forms: Forms = NO_FORMS
+    candidates: int = 0
 
 
 NO_SIZES = Sizes(np.zeros(0), np.zeros(0))
@@ -166,6 +168,9 @@ def diameter_by(
     for task in tasks:
         before = diameter_of(frames)
         frames.append(measured_sizes(task, None if before is None else before.lenses))
+        # Where none of so many stands alone, with any size, in the next image none does either.
+        if not frames[-1].square.size and frames[-1].candidates >= MOST_TRACERS:
+            break
         # The two images of a pair must agree.
         if len(frames) >= FEWEST_FRAMES and sum(sizes.square.size for sizes in frames) >= ENOUGH:
             break
@@ -231,7 +236,8 @@ def measured_sizes(task: Task, diameter: float | None = None) -> Sizes:
         found = accepted(task, _begun(task, state), sought.candidates.copy(), SEARCH[0])
         diameter = _tried(task, found, _steps(diameter, share), SEARCH[0].unexplained).diameter
     sizes = _settled_sizes(sought, diameter, SEARCH)
-    return sizes if sizes.square.size else _settled_sizes(sought, *_least_misfit(sought))
+    sizes = sizes if sizes.square.size else _settled_sizes(sought, *_least_misfit(sought))
+    return sizes._replace(candidates=len(candidates))
 
 
 class Region(NamedTuple):
