@@ -94,6 +94,9 @@ def test_same_bits_for_any_number_of_threads_and_any_batch(small, space, rng, mo
         assert np.array_equal(picture(), expected)
     monkeypatch.setattr(render, "RAYS_AT_ONCE", 1000)
     assert np.array_equal(picture(), expected)
+    done = []
+    render_points(small, space, Balls(points, 1.0, 0.05), rng, rays=500, progress=done.append)
+    assert sum(done) == 7
 
 
 def test_windows_that_are_needed_or_ignored(small, water, rng):

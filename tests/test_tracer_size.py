@@ -1,6 +1,7 @@
 """The tracers' diameter and the sensor's diffusion by images: what is true comes out, and what contradicts is told."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.camera import Camera, Lattice
 from lfpiv_cli.optics.line_responses import USUAL_DIFFUSION_PX
 from lfpiv_cli.optics.media import Media
-from lfpiv_cli.particles.diameter import NO_SIZES, Diameter, Sizes, diameter_by, diameter_of
+from lfpiv_cli.particles.diameter import NO_SIZES, Diameter, Sizes, Trial, _settled_sizes, diameter_by, diameter_of
 from lfpiv_cli.particles.diffusion import MODEL_SHARE, MODEL_SQUARES, Forms, forms_of, together_of
 from lfpiv_cli.particles.search import Task
 from lfpiv_cli.particles.view import Light, raw_view, with_radius
@@ -79,7 +80,7 @@ def test_by_waves_diffusion_is_found_too(table2: Camera, water: Media, rng: np.r
 @pytest.mark.thorough
 @pytest.mark.parametrize("number", [60, 400])
 def test_crowded_diameters_are_right(table2: Camera, water: Media, rng: np.random.Generator, number: int) -> None:
-    # Some .9 and 6 tracers for each microlens: of six, ten of forty seem to stand alone, 0.72 microlenses wide.
+    # Some .9 and 6 tracers for each microlens.
     camera = replace(table2, columns=260, rows=240)
     tracers = rng.uniform((-0.7, -0.65, 0.5, 3e5), (0.7, 0.65, 2.0, 7e5), (number, 4))
     tasks = iter(tasks_of(camera, water, [image_of(camera, water, tracers, 0.5)] * (3 if number < 100 else 2), rng))
@@ -157,6 +158,16 @@ def of_diffusion(*found: float, **known: bool) -> TracerSize:
 def test_notices_of_diameter_and_diffusion(given: float | None, size: TracerSize, codes: list[str]) -> None:
     settings = load_rig(ROOT / "configs" / "table2.yaml").overridden("reconstruction", particle_diameter_mm=given)
     assert [notice.code for notice in size_notices(settings, size)] == codes
+
+
+@pytest.mark.parametrize(("count", "enough"), [(40, True), (20, True), (19, False), (10, False), (0, False)])
+def test_a_size_is_that_of_half_the_tracers(monkeypatch: pytest.MonkeyPatch, count: int, enough: bool) -> None:
+    losses = np.square(np.arange(-2.0, 3.0))[:, np.newaxis] * np.ones(40)
+    trial, found = Trial(0.5, losses, np.arange(40) < count), (SimpleNamespace(view=None), None)
+    for name, answer in (("_found", found), ("_tried", trial), ("by_waves", False)):
+        monkeypatch.setattr(f"lfpiv_cli.particles.diameter.{name}", lambda *_, answer=answer: answer)
+    # Six for each microlens, of which ten of forty seemed to stand alone, showed 0.72 microlenses in place of 0.5.
+    assert (_settled_sizes(None, 0.5, ()).square.size == count > 0) == enough  # type: ignore[arg-type]
 
 
 def test_images_that_contradict_each_other_are_told() -> None:
