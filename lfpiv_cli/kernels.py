@@ -9,13 +9,14 @@ from __future__ import annotations
 
 import gc
 from collections.abc import Callable
-from functools import cached_property
+from functools import cache, cached_property
 from types import FunctionType
 from typing import Any
 
-from numba import config, types
+from numba import cfunc, config, typeof, types
 from numba.core.caching import NullCache
 from numba.core.registry import CPUDispatcher
+from numba.core.typing.templates import Signature
 
 # For compiled functions that make no arrays: of every array that a function is given, in tuples too, numba counts the
 # references, which takes longer than what a short function does.
@@ -66,3 +67,17 @@ def njit(*, cache: bool = False, **options: Any) -> Callable[[Callable[..., Any]
         return kernel
 
     return compiled
+
+
+def by_address(kernel: Callable[..., Any], result: types.Type, *arguments: object) -> Any:
+    """Return a kernel for kernels to call by its address, with arguments like these.
+
+    Kernels that call a compiled function hold a copy of it, for which it is compiled again; one that is called by its
+    address is compiled once.
+    """
+    return kernel if config.DISABLE_JIT else _compiled_for(kernel, result(*map(typeof, arguments)))
+
+
+@cache
+def _compiled_for(kernel: Kernel, signature: Signature) -> Any:
+    return cfunc(signature, cache=True)(kernel.py_func)

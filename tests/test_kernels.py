@@ -16,6 +16,16 @@ def total(values: Floats) -> float:
 
 
 @njit()
+def share(value: int, of: int) -> int:
+    return value // of
+
+
+@njit()
+def half_of_share(value: int, of: int) -> int:
+    return share(value, of) // 2
+
+
+@njit()
 def twice(values: Floats) -> float:
     return 2.0 * total(values)
 
@@ -28,3 +38,10 @@ def test_a_function_is_compiled_for_python_where_python_calls_it() -> None:
     assert total(np.array([1.0, 2.0])) == 3.0
     assert len(total.signatures) == 1
     assert gc.isenabled()
+
+
+@pytest.mark.skipif(config.DISABLE_JIT, reason="nothing is compiled")
+def test_errors_come_out_of_what_kernels_call() -> None:
+    assert half_of_share(9, 2) == 2
+    with pytest.raises(ZeroDivisionError):
+        half_of_share(9, 0)

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from lfpiv_cli.kernels import njit
 from lfpiv_cli.particles.diffusion import NO_FORMS, Forms, Together, forms_of, together_of
-from lfpiv_cli.particles.fitting import NO_FURTHER, Choice, begin_at, fit_best, judge
+from lfpiv_cli.particles.fitting import NO_FURTHER, Choice, Fits, begin_at, fits_of, judge
 from lfpiv_cli.particles.least_squares import (
     SMALLEST_GAIN,
     UNKNOWNS,
@@ -523,10 +523,11 @@ def _fitted(
     tracers : (n, 4) where fits begin
     depths_mm : (n, k) their depths
     """
+    fits = fits_of(sized)
     change, fitted, starts = np.zeros(len(tracers)), tracers.copy(), np.clip(depths_mm, *observation.depths_mm)
 
     def work(numbers: NDArray[np.int64]) -> None:
-        _fit_each(observation, sized, tracers, numbers, starts, change, fitted)
+        _fit_each(observation, sized, fits, tracers, numbers, starts, change, fitted)
 
     larger = max(observation.optics, sized.optics, key=lambda view: view.particle_radius_mm)
     over_tiles(work, larger, tracers, observation.depths_mm)
@@ -537,6 +538,7 @@ def _fitted(
 def _fit_each(
     observation: Observation,
     sized: Observation,
+    fits: Fits,
     tracers: NDArray[np.float64],
     numbers: NDArray[np.int64],
     depths_mm: NDArray[np.float64],
@@ -554,5 +556,6 @@ def _fit_each(
         pixels, values = lit_by(own, 0)
         add_light(pixels, values, tracers[number, 3], residual)
         begin_at(sized.optics, tracers[number], depths_mm[number], starts)
-        change[number] = fit_best(sized, starts, prior, responses, choice, (0.0, 0.0), fitted[number : number + 1])
+        best = fitted[number : number + 1]
+        change[number] = fits.best(sized, fits.one, starts, prior, responses, choice, (0.0, 0.0), best)
         add_light(pixels, values, -tracers[number, 3], residual)

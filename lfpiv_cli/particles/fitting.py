@@ -7,15 +7,18 @@ Axes: image axes, mm; light in counts; residual and weights as flat images. A pa
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
+from numba import float64
 from numpy.typing import NDArray
 
 from lfpiv_cli.arrays import Floats
-from lfpiv_cli.kernels import COUNT_NO_REFERENCES, njit
+from lfpiv_cli.kernels import COUNT_NO_REFERENCES, by_address, njit
 from lfpiv_cli.particles.least_squares import (
     CHOICE_GAIN,
+    NO_ROWS,
     SMALLEST_GAIN,
     SUMS,
     UNKNOWNS,
@@ -92,6 +95,9 @@ def refine(
     return fit_again(observation, particles, every, Effort(SWEEP_STEPS, enough), prior=prior).gain
 
 
+Fit: TypeAlias = Callable[[Observation, Floats, Floats, Responses, Effort], float]
+
+
 class Choice(NamedTuple):
     """How the best of several places where a fit can begin is found.
 
@@ -130,6 +136,7 @@ def begin_at(view: View, particle: Floats, depths_mm: Floats, starts: Floats) ->
 @njit(cache=True)
 def fit_best(
     observation: Observation,
+    fit_one: Fit,
     starts: Floats,
     prior: Floats,
     responses: Responses,
@@ -141,6 +148,7 @@ def fit_best(
 
     Parameters
     ----------
+    fit_one : `least_squares.fit`
     starts : (n, k, 4) where fits begin, worked on; with `UNKNOWN_LIGHT` the best one there is taken, depths that are
         NaN are left out
     prior : (k, 8) see `least_squares.fit`
@@ -160,19 +168,40 @@ def fit_best(
         if starts[n, 0, 3] == UNKNOWN_LIGHT:
             pixels, values = lit_by(responses, 0)
             starts[n, 0, 3] = best_light(pixels, values, observation.residual, observation.weight)
-        changes[n] = fit(observation, starts[n], prior, responses, choice.first)
+        changes[n] = fit_one(observation, starts[n], prior, responses, choice.first)
     for _ in range(min(choice.finalists, len(starts))):
         chosen = np.argmin(changes)
         if changes[chosen] > promising:
             break
         changes[chosen] = np.inf
         observation.respond(view, starts[chosen], responses)
-        change = fit(observation, starts[chosen], prior, responses, choice.then)
+        change = fit_one(observation, starts[chosen], prior, responses, choice.then)
         light = starts[chosen, :, 3]
         if change < lowest and choice.faintest <= light.min() and light.max() < choice.brightest:
             lowest = change
             copy_rows(starts[chosen], best)
     return lowest
+
+
+class Fits(NamedTuple):
+    """The fits that kernels call, by their addresses.
+
+    Attributes
+    ----------
+    one : `least_squares.fit`
+    best : `fit_best`
+    """
+
+    one: Fit
+    best: Callable[[Observation, Fit, Floats, Floats, Responses, Choice, tuple[float, float], Floats], float]
+
+
+def fits_of(observation: Observation) -> Fits:
+    """Return the fits to an observation."""
+    responses, starts = room_for(1, 1, 0), np.empty((0, 0, UNKNOWNS))
+    one = by_address(fit, float64, observation, NO_ROWS, NO_ROWS, responses, NO_FURTHER)
+    of_best = observation, one, starts, NO_ROWS, responses, NOWHERE_ELSE, (0.0, 0.0), NO_ROWS
+    return Fits(one, by_address(fit_best, float64, *of_best))
 
 
 class Refitted(NamedTuple):
@@ -222,10 +251,10 @@ def fit_again(
     """
     expected = nothing_expected(len(particles)) if prior is None else prior
     others = Elsewhere(np.empty((len(particles), 0)), NOWHERE_ELSE, 0.0) if elsewhere is None else elsewhere
-    refitted = Refitted(np.zeros(len(particles), np.bool_), np.zeros(len(particles)))
+    fits, refitted = fits_of(observation), Refitted(np.zeros(len(particles), np.bool_), np.zeros(len(particles)))
 
     def work(numbers: NDArray[np.int64]) -> None:
-        _fit_again(observation, particles, expected, numbers[chosen[numbers]], effort, others, refitted)
+        _fit_again(observation, fits, particles, expected, numbers[chosen[numbers]], effort, others, refitted)
 
     over_tiles(work, observation.optics, particles, observation.depths_mm)
     return refitted
@@ -234,6 +263,7 @@ def fit_again(
 @njit(cache=True, nogil=True)
 def _fit_again(
     observation: Observation,
+    fits: Fits,
     particles: Floats,
     prior: Floats,
     numbers: NDArray[np.int64],
@@ -252,11 +282,12 @@ def _fit_again(
         pixels, values = lit_by(responses, 0)
         add_light(pixels, values, best[0, 3], residual)
         before = change_by(pixels, values, best[0, 3], residual, observation.weight) + prior_chi2(best, expected)
-        after = fit(observation, best, expected, responses, effort)
+        after = fits.one(observation, best, expected, responses, effort)
         if depths.shape[1] > 0:
             lowest = after - elsewhere.gain
             begin_at(view, particles[number], depths[number], starts)
-            change = fit_best(observation, starts, expected, responses, elsewhere.choice, (np.inf, lowest), best)
+            choice, limits = elsewhere.choice, (np.inf, lowest)
+            change = fits.best(observation, fits.one, starts, expected, responses, choice, limits, best)
             if change < lowest:
                 after = change
                 refitted.moved[number] = True
@@ -277,10 +308,11 @@ def other_ends(
     Returned are the ends (n, k, 4), and by how much chi-squared is larger there than where they are (n, k), infinite
     for those that are not chosen. The residual is in place again on return.
     """
+    fits = fits_of(observation)
     ends, rises = np.zeros((*places.shape[:2], UNKNOWNS)), np.full(places.shape[:2], np.inf)
 
     def work(numbers: NDArray[np.int64]) -> None:
-        _other_ends(observation, particles, numbers[chosen[numbers]], places, effort, ends, rises)
+        _other_ends(observation, fits, particles, numbers[chosen[numbers]], places, effort, ends, rises)
 
     over_tiles(work, observation.optics, particles, observation.depths_mm)
     return ends, rises
@@ -289,6 +321,7 @@ def other_ends(
 @njit(cache=True, nogil=True)
 def _other_ends(
     observation: Observation,
+    fits: Fits,
     particles: Floats,
     numbers: NDArray[np.int64],
     places: Floats,
@@ -312,7 +345,7 @@ def _other_ends(
             observation.respond(view, end, responses)
             pixels, values = lit_by(responses, 0)
             end[0, 3] = best_light(pixels, values, residual, weight)
-            rises[number, k] = fit(observation, end, prior, responses, effort) - before
+            rises[number, k] = fits.one(observation, end, prior, responses, effort) - before
         observation.respond(view, own, responses)
         pixels, values = lit_by(responses, 0)
         add_light(pixels, values, -own[0, 3], residual)
@@ -341,14 +374,13 @@ class Least(NamedTuple):
 
 def accept(observation: Observation, candidates: Floats, least: Least) -> NDArray[np.bool_]:
     """Fit candidates (n, 4) in place, one after the other; return which ones stay, their light off the residual."""
-    accepted = np.zeros(len(candidates), np.bool_)
-
+    accepted, fits = np.zeros(len(candidates), np.bool_), fits_of(observation)
     choice = Choice(Effort(FIRST_STEPS, CHOICE_GAIN), Effort(CANDIDATE_STEPS, CHOICE_GAIN), 1, least.light, np.inf)
     depths = candidates[:, 2:3] + START_DEPTHS * observation.optics.scale.depth_mm
     depths = np.clip(depths, observation.low_mm, observation.high_mm)
 
     def work(numbers: NDArray[np.int64]) -> None:
-        _accept(observation, candidates, numbers, choice, depths, least, accepted)
+        _accept(observation, fits, candidates, numbers, choice, depths, least, accepted)
 
     over_tiles(work, observation.optics, candidates, observation.depths_mm)
     return accepted
@@ -357,6 +389,7 @@ def accept(observation: Observation, candidates: Floats, least: Least) -> NDArra
 @njit(cache=True, nogil=True)
 def _accept(
     observation: Observation,
+    fits: Fits,
     candidates: Floats,
     numbers: NDArray[np.int64],
     choice: Choice,
@@ -370,7 +403,8 @@ def _accept(
     starts, best = np.empty((depths.shape[1], 1, UNKNOWNS)), np.empty((1, UNKNOWNS))
     for number in numbers:
         begin_at(observation.optics, candidates[number], depths[number], starts)
-        if fit_best(observation, starts, prior, responses, choice, (0.0, -least.gain), best) >= -least.gain:
+        limits = 0.0, -least.gain
+        if fits.best(observation, fits.one, starts, prior, responses, choice, limits, best) >= -least.gain:
             continue
         observation.respond(observation.optics, best, responses)
         pixels, values = lit_by(responses, 0)

@@ -27,7 +27,7 @@ from scipy.spatial import KDTree
 from lfpiv_cli.arrays import Floats
 from lfpiv_cli.grid import Scale
 from lfpiv_cli.kernels import njit
-from lfpiv_cli.particles.fitting import NO_FURTHER, Choice, begin_at, fit_best, nothing_expected
+from lfpiv_cli.particles.fitting import NO_FURTHER, Choice, Fits, begin_at, fits_of, nothing_expected
 from lfpiv_cli.particles.least_squares import (
     CHOICE_GAIN,
     UNKNOWNS,
@@ -195,13 +195,13 @@ def join(
     (m, 2) of particles (n, 4) are joined, each particle once at most.
     """
     joined, free = np.zeros(len(pairs), np.bool_), np.ones(len(particles), np.bool_)
-    light = particles[pairs, 3:]
+    light, fits = particles[pairs, 3:], fits_of(observation)
     middle = np.sum(particles[pairs] * light, axis=1) / np.maximum(light.sum(axis=1), np.finfo(np.float64).tiny)
     # Starts lie in the middle: from there fits move no further than tiles allow.
     limits = np.column_stack([largest_loss, brightest])
 
     def work(numbers: NDArray[np.int64]) -> None:
-        joined[numbers] = _join(observation, particles, middle, pairs, numbers, limits, free)
+        joined[numbers] = _join(observation, fits, particles, middle, pairs, numbers, limits, free)
 
     over_tiles(work, observation.optics, middle, observation.depths_mm)
     return joined
@@ -210,6 +210,7 @@ def join(
 @njit(cache=True, nogil=True)
 def _join(
     observation: Observation,
+    fits: Fits,
     particles: Floats,
     middle: Floats,
     pairs: NDArray[np.int64],
@@ -239,7 +240,8 @@ def _join(
         begin_at(view, middle[number], depths, starts)
         choice = Choice(effort, NO_FURTHER, len(starts), LEAST_LIGHT, limits[number, 1])
         highest = two + limits[number, 0]
-        joined[k] = fit_best(observation, starts, prior, responses, choice, (np.inf, highest), best) < highest
+        lowest = fits.best(observation, fits.one, starts, prior, responses, choice, (np.inf, highest), best)
+        joined[k] = lowest < highest
         if joined[k]:
             copy_rows(best, particles[first : first + 1])
             free[first] = free[second] = False

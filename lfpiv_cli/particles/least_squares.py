@@ -15,23 +15,22 @@ Axes: image axes, mm; light in counts; residual and weights as flat images. A pa
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cache
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
-from numba import cfunc, config, float64, typeof, void
-from numba.core.typing.templates import Signature
+from numba import void
 from numba.core.typing.typeof import typeof_impl
 from numpy.typing import NDArray
 
 from lfpiv_cli.arrays import Floats, Singles
-from lfpiv_cli.kernels import COUNT_NO_REFERENCES, njit
+from lfpiv_cli.kernels import COUNT_NO_REFERENCES, by_address, njit
 from lfpiv_cli.particles.line_light import VALUES, respond_by_lines
 from lfpiv_cli.particles.refraction import bend_of
 from lfpiv_cli.particles.rows import SLACK, Scratch, respond_rows, scratch
 from lfpiv_cli.particles.view import LARGEST_MOVE_LENSES, View, by_waves, entry_capacity, type_by_form
 
 UNKNOWNS = 4
+NO_ROWS = np.empty((0, UNKNOWNS))
 # Damping relative to the diagonal: its start, and the factors after a step that failed or helped.
 DAMPING = 1e-3
 DAMPING_UP = 10.0
@@ -386,27 +385,11 @@ def respond_all(view: View, members: Floats, responses: Responses) -> None:
 
 
 def respond_of(view: View) -> Respond:
-    """Return the address of what writes responses, as `respond_all` does, by the view's light.
-
-    Kernels that call a compiled function hold a copy of it, for which it is compiled again; one that is called by its
-    address is compiled once, and only for the light that is asked for.
-    """
-    return _address_of(by_waves(view), void(typeof(view), float64[:, ::1], typeof(room_for(1, 1, 0))))
-
-
-@cache
-def _address_of(waves: bool, signature: Signature) -> Respond:
-    write = _write_by_waves if waves else _write_by_rays
-    address: Respond = write if config.DISABLE_JIT else cfunc(signature, cache=True)(write)
-    return address
-
-
-def _write_by_rays(view: View, members: Floats, responses: Responses) -> None:
-    _respond_by_rays(view, members, responses)
-
-
-def _write_by_waves(view: View, members: Floats, responses: Responses) -> None:
-    _respond_by_waves(view, members, responses)
+    """Return the address of what writes responses, as `respond_all` does, by the view's light."""
+    respond: Respond = by_address(
+        _respond_by_waves if by_waves(view) else _respond_by_rays, void, view, NO_ROWS, room_for(1, 1, 0)
+    )
+    return respond
 
 
 @njit(cache=True)

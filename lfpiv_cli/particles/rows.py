@@ -80,6 +80,8 @@ ENTRY, LOW = 4, 5
 # Lenses share profiles where that moves a profile by less than this share of the ball's radius: at second order up to
 # 3e-3 of the light is elsewhere then, which moves places by 30 nm.
 SHARED = 0.05
+# Numbers that are no part of a type: for plain ones `_line_up` is compiled once each.
+AXES = np.int64(0), np.int64(1)
 
 
 class Entries(NamedTuple):
@@ -271,13 +273,13 @@ def _write_block(
     camera, room, x, y = view.camera, entries.room, projection.x, projection.y
     middle = view.centres_mm[block.j + block.rows // 2, block.i + block.columns // 2]
     bent = bent_at(view, projection, bend, middle[0], middle[1])
-    columns = _line_up(view, projection, (bend, bent), block, 0, room)
+    columns = _line_up(view, projection, (bend, bent), block, AXES[0], room)
     if columns == 0:
         return 0
     _set_away(room, columns)
     if block.alone:
         _order_columns(room, columns, mean_width(view, projection))
-    rows = _line_up(view, projection, (bend, bent), block, 1, room)
+    rows = _line_up(view, projection, (bend, bent), block, AXES[1], room)
     if rows == 0:
         return 0
     _fill(view, x, x.stretch * x.alpha + bent.gain_x, columns, room.table)

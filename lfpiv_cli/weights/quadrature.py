@@ -162,7 +162,7 @@ def _set_boxes(part: tuple[int, int], scene: Scene, boxes: Integers) -> None:
         centre, plane, box = scene.centres_mm[n], scene.plane[n], boxes[n]
         low, high = np.full(2, np.inf), np.full(2, -np.inf)
         point = centre.copy()
-        if rays_from(scene, centre, plane, 0).shape[1] == 0:
+        if rays_from(scene, centre, plane, np.int64(0)).shape[1] == 0:
             box[:] = 0
             continue
         for k in range(scene.depth_share.size):

@@ -260,8 +260,7 @@ def rays_at_depth(scene: Scene, voxel: Floats, plane: int, node: int, point: Flo
 
     A depth outside the fluid counts as the voxel's middle.
     """
-    point[:] = voxel
-    point[2] = scene.depth_mm[plane, node]
+    point[0], point[1], point[2] = voxel[0], voxel[1], scene.depth_mm[plane, node]
     rays = rays_from(scene, point, plane, node)
     if rays.shape[1] == 0:
         point[2] = voxel[2]
