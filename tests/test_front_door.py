@@ -12,8 +12,14 @@ import yaml
 from pydantic import ValidationError
 
 import lfpiv_cli
+from lfpiv_cli.files import images
+from lfpiv_cli.files.recording import Recording
 from lfpiv_cli.files.sections_work import flow_of, flow_section
-from lfpiv_cli.grid import Reference
+from lfpiv_cli.flow.correlation import correlate
+from lfpiv_cli.flow.windows import WEIGHTINGS, CorrelationSettings
+from lfpiv_cli.grid import Grid, Reference
+from lfpiv_cli.reconstruction.registry import SOLVERS, Solver
+from lfpiv_cli.reconstruction.solvers import SolverSettings, reconstruct
 from lfpiv_cli.synthetic.flows import FLOWS, Flow
 from tests.commands import ROOT
 
@@ -83,6 +89,56 @@ def test_guide_lists_files_and_tests_for_each_addition() -> None:
         assert any(path.startswith("tests/") for path in paths), title
     # What is added most touches four files.
     assert all(1 <= len(touched[title]) <= 4 for title in most), touched
+
+
+class Pixels:
+    """Two voxels, each of which lights its own pixel."""
+
+    shape = (1, 1, 2)
+
+    def forward(self, volume: np.ndarray) -> np.ndarray:
+        return volume[0]
+
+    def adjoint(self, image: np.ndarray) -> np.ndarray:
+        return image[np.newaxis]
+
+
+def halve(problem, volume, projection, relaxation):
+    return volume / 2
+
+
+def test_a_solver_is_added_by_its_step_and_its_name(monkeypatch) -> None:
+    monkeypatch.setitem(SOLVERS, "halve", Solver(f"{__name__}:{halve.__name__}"))
+    result = reconstruct(Pixels(), np.array([[4.0, 2.0]], np.float32), SolverSettings("halve", 3))
+    start = reconstruct(Pixels(), np.array([[4.0, 2.0]], np.float32), SolverSettings("halve", 0))
+    np.testing.assert_array_equal(result.volume, start.volume / 8)
+    assert result.residual.shape == (4,)
+
+
+def test_a_weighting_is_added_by_its_function_and_its_name(monkeypatch) -> None:
+    def triangle(offset):
+        return 1.0 - 2.0 * np.abs(offset)
+
+    monkeypatch.setitem(WEIGHTINGS, "triangle", triangle)
+    a, b = np.random.default_rng(3).random((2, 12, 12, 12)).astype(np.float32)
+    b[:, :, 1:] = a[:, :, :-1]
+    found, grid = {}, Grid.centred((12, 12, 12), (1.0, 1.0, 1.0), (0.0, 0.0, 0.0))
+    for weighting in ("uniform", "triangle"):
+        settings = CorrelationSettings(((8, 8, 8),), (0.5, 0.5, 0.5), 1.0, 1.0, weighting)
+        found[weighting] = correlate([(a, b)], grid, settings).displacement_voxel
+        np.testing.assert_allclose(np.nanmedian(found[weighting][..., 0]), 1.0, atol=0.05)
+    assert not np.array_equal(found["uniform"], found["triangle"])
+
+
+def test_a_camera_format_is_added_by_its_reader_and_its_line(monkeypatch, tmp_path) -> None:
+    image = np.arange(12, dtype=np.float32).reshape(3, 4)
+
+    def frames(path):
+        return Recording(1, image.shape, 16, lambda page, shape: image)
+
+    monkeypatch.setattr(images, "FORMATS", (images.Format("text", frames, suffixes=(".text",)), *images.FORMATS))
+    (tmp_path / "a.text").write_text("an image")
+    np.testing.assert_array_equal(images.read_image(tmp_path / "a.text"), image)
 
 
 def expansion(rate_per_s: float, radius_mm: float = 1.0, centre_mm: Sequence[float] = (0.0, 0.0, 0.0)) -> Flow:
