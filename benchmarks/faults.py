@@ -26,7 +26,6 @@ from scipy import ndimage
 
 from benchmarks.rig_drawing import DrawnRig, Tree, draw
 from benchmarks.rigs import ADVICE, Step, codes, photograph_white, run_command, soil
-from lfpiv_cli.calibration.lattice import fit_lattice
 from lfpiv_cli.files.images import read_image, write_tiff
 
 SEED, RIGS, GOOD = 20261122, 2, 10
@@ -51,7 +50,8 @@ class Experiment:
     Attributes
     ----------
     reported : the rig file
-    pictures : white, dark, board, pair_a, pair_b; what is missing is not given to the program
+    pictures : white, dark, board, pair_a, pair_b, and other, the second image of another recording; what is missing is
+        not given to the program
     full_counts : where the sensor saturates
     """
 
@@ -150,12 +150,6 @@ def gamma(e: Experiment) -> Experiment:
     return e.with_pictures(**{name: full * (e.pictures[name] / full) ** 0.45 for name in ("pair_a", "pair_b")})
 
 
-def other_tracers(e: Experiment) -> Experiment:
-    """Return the pair with other tracers in its second image: those of ten microlenses further on."""
-    lattice = fit_lattice(e.pictures["white"], e.pictures["dark"]).lattice_px
-    return e.changed("pair_b", lambda picture: ndimage.shift(picture, 10.0 * lattice.basis[0][::-1], order=1))
-
-
 def flipped(*axes: int) -> Callable[[Picture], Picture]:
     """Return a picture mirrored along axes."""
     return lambda picture: np.flip(picture, axes)
@@ -215,7 +209,7 @@ FAULTS = (
         lambda e: e.with_pictures(dark=e.pictures["dark"] + max(8.0 * e.pictures["dark"].std(), 3.0)),
     ),
     Fault("dark in other bits", "frame", lambda e: e.with_pictures(dark=np.floor(e.pictures["dark"] / 4.0))),
-    Fault("images of two recordings", "pair", other_tracers),
+    Fault("images of two recordings", "pair", given_as("other", "pair_b")),
     Fault("the same image twice", "pair", given_as("pair_a", "pair_b")),
     Fault("pair exchanged", "pair", exchanged("pair_a", "pair_b"), knowable=False),
     Fault("index 5 % off", "calibrate", reported("media.fluid", times(1.05)), knowable=False),
@@ -273,10 +267,15 @@ class Bench:
             step = run_command("simulate", what, true, "-o", images)
             if step.exit_code:
                 return None
+        # Another recording's second image.
+        scene, other = rig.true["simulation"], folder / "other.yaml"
+        other.write_text(yaml.safe_dump(rig.true | {"simulation": scene | {"seed": scene["seed"] + 1}}))
+        run_command("simulate", "particles", other, "-o", folder / "other")
+        (folder / "other" / "pair_b.tif").rename(images / "other.tif")
         soil(images, rig)
         sensor = rig.true["camera"]["sensor"]
         shape = (sensor["rows"], sensor["columns"])
-        names = ("white", "dark", *(["board"] if rig.board else []), "pair_a", "pair_b")
+        names = ("white", "dark", *(["board"] if rig.board else []), "pair_a", "pair_b", "other")
         pictures = {name: read_image(images / f"{name}.tif", shape=shape).astype(np.float64) for name in names}
         return cls(rig, Experiment(rig.reported, pictures, 2.0 ** rig.true["simulation"]["bits"] - 1.0), folder)
 
