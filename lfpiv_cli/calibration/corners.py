@@ -208,8 +208,10 @@ class Look(ABC):
         if waves is not None:
             shares_at = partial(waves.shares_and_slopes, rays, shape.strips(waves.lens_mm), steps)
         found = fit_shape(near, start_mm, steps, scene_points(rays, camera, medium, z) - start_mm[:2], shares_at)
+        # Where its pixels do not hold a point in some direction, rounding leaves variances of 0 or less.
+        held = found.converged and bool((np.diag(found.covariance_mm2) > 0.0).all())
         # What is darker than the ground is no dot; of a corner's squares either two may be the dark ones.
-        return found if found.converged and (found.brightness > 0.0 or board.pattern != "dots") else None
+        return found if held and (found.brightness > 0.0 or board.pattern != "dots") else None
 
 
 @dataclass(frozen=True, eq=False)
