@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from lfpiv_cli.kernels import njit
 from lfpiv_cli.particles.diffusion import NO_FORMS, Forms, Together, forms_of, together_of
-from lfpiv_cli.particles.fitting import NO_FURTHER, Choice, Fits, begin_at, fits_of, judge
+from lfpiv_cli.particles.fitting import NO_FURTHER, Choice, Fitter, begin_at, fitter_of, judge
 from lfpiv_cli.particles.least_squares import (
     SMALLEST_GAIN,
     UNKNOWNS,
@@ -523,11 +523,11 @@ def _fitted(
     tracers : (n, 4) where fits begin
     depths_mm : (n, k) their depths
     """
-    fits = fits_of(sized)
+    fitter = fitter_of(sized)
     change, fitted, starts = np.zeros(len(tracers)), tracers.copy(), np.clip(depths_mm, *observation.depths_mm)
 
     def work(numbers: NDArray[np.int64]) -> None:
-        _fit_each(observation, sized, fits, tracers, numbers, starts, change, fitted)
+        _fit_each(observation, fitter, tracers, numbers, starts, change, fitted)
 
     larger = max(observation.optics, sized.optics, key=lambda view: view.particle_radius_mm)
     over_tiles(work, larger, tracers, observation.depths_mm)
@@ -537,8 +537,7 @@ def _fitted(
 @njit(cache=True, nogil=True)
 def _fit_each(
     observation: Observation,
-    sized: Observation,
-    fits: Fits,
+    fitter: Fitter,
     tracers: NDArray[np.float64],
     numbers: NDArray[np.int64],
     depths_mm: NDArray[np.float64],
@@ -546,7 +545,7 @@ def _fit_each(
     fitted: NDArray[np.float64],
 ) -> None:
     """Do the work of `_fitted` for the tracers of a tile."""
-    residual = observation.residual
+    residual, sized = observation.residual, fitter.observation
     own, responses = room_for(1, observation.capacity, 0), room_for(1, sized.capacity, 0)
     starts, prior = np.empty((depths_mm.shape[1], 1, UNKNOWNS)), np.zeros((1, 2 * UNKNOWNS))
     effort = Effort(STEPS, SMALLEST_GAIN)
@@ -557,5 +556,5 @@ def _fit_each(
         add_light(pixels, values, tracers[number, 3], residual)
         begin_at(sized.optics, tracers[number], depths_mm[number], starts)
         best = fitted[number : number + 1]
-        change[number] = fits.best(sized, fits.one, starts, prior, responses, choice, (0.0, 0.0), best)
+        change[number] = fitter.best((sized, fitter.one), starts, prior, responses, choice, (0.0, 0.0), best)
         add_light(pixels, values, -tracers[number, 3], residual)

@@ -135,8 +135,7 @@ def begin_at(view: View, particle: Floats, depths_mm: Floats, starts: Floats) ->
 
 @njit(cache=True)
 def fit_best(
-    observation: Observation,
-    fit_one: Fit,
+    to: tuple[Observation, Fit],
     starts: Floats,
     prior: Floats,
     responses: Responses,
@@ -148,7 +147,7 @@ def fit_best(
 
     Parameters
     ----------
-    fit_one : `least_squares.fit`
+    to : what is fitted to, and `least_squares.fit`
     starts : (n, k, 4) where fits begin, worked on; with `UNKNOWN_LIGHT` the best one there is taken, depths that are
         NaN are left out
     prior : (k, 8) see `least_squares.fit`
@@ -159,6 +158,7 @@ def fit_best(
     -------
     what the best adds to chi-squared, the second of the limits where none is better
     """
+    observation, fit_one = to
     changes, view = np.full(len(starts), np.inf), observation.optics
     promising, lowest = limits
     for n in range(len(starts)):
@@ -183,25 +183,27 @@ def fit_best(
     return lowest
 
 
-class Fits(NamedTuple):
-    """The fits that kernels call, by their addresses.
+class Fitter(NamedTuple):
+    """What kernels fit particles with, by the functions' addresses.
 
     Attributes
     ----------
+    observation : what is fitted to
     one : `least_squares.fit`
     best : `fit_best`
     """
 
+    observation: Observation
     one: Fit
-    best: Callable[[Observation, Fit, Floats, Floats, Responses, Choice, tuple[float, float], Floats], float]
+    best: Callable[[tuple[Observation, Fit], Floats, Floats, Responses, Choice, tuple[float, float], Floats], float]
 
 
-def fits_of(observation: Observation) -> Fits:
-    """Return the fits to an observation."""
+def fitter_of(observation: Observation) -> Fitter:
+    """Return what fits particles to an observation."""
     responses, starts = room_for(1, 1, 0), np.empty((0, 0, UNKNOWNS))
     one = by_address(fit, float64, observation, NO_ROWS, NO_ROWS, responses, NO_FURTHER)
-    of_best = observation, one, starts, NO_ROWS, responses, NOWHERE_ELSE, (0.0, 0.0), NO_ROWS
-    return Fits(one, by_address(fit_best, float64, *of_best))
+    of_best = (observation, one), starts, NO_ROWS, responses, NOWHERE_ELSE, (0.0, 0.0), NO_ROWS
+    return Fitter(observation, one, by_address(fit_best, float64, *of_best))
 
 
 class Refitted(NamedTuple):
@@ -251,10 +253,10 @@ def fit_again(
     """
     expected = nothing_expected(len(particles)) if prior is None else prior
     others = Elsewhere(np.empty((len(particles), 0)), NOWHERE_ELSE, 0.0) if elsewhere is None else elsewhere
-    fits, refitted = fits_of(observation), Refitted(np.zeros(len(particles), np.bool_), np.zeros(len(particles)))
+    fitter, refitted = fitter_of(observation), Refitted(np.zeros(len(particles), np.bool_), np.zeros(len(particles)))
 
     def work(numbers: NDArray[np.int64]) -> None:
-        _fit_again(observation, fits, particles, expected, numbers[chosen[numbers]], effort, others, refitted)
+        _fit_again(fitter, particles, expected, numbers[chosen[numbers]], effort, others, refitted)
 
     over_tiles(work, observation.optics, particles, observation.depths_mm)
     return refitted
@@ -262,8 +264,7 @@ def fit_again(
 
 @njit(cache=True, nogil=True)
 def _fit_again(
-    observation: Observation,
-    fits: Fits,
+    fitter: Fitter,
     particles: Floats,
     prior: Floats,
     numbers: NDArray[np.int64],
@@ -272,7 +273,8 @@ def _fit_again(
     refitted: Refitted,
 ) -> None:
     """Do the work of `fit_again` for the particles of a tile."""
-    view, residual, depths = observation.optics, observation.residual, elsewhere.depths_mm
+    observation, depths = fitter.observation, elsewhere.depths_mm
+    view, residual = observation.optics, observation.residual
     responses = room_for(1, observation.capacity, 0)
     starts, best = np.empty((depths.shape[1], 1, UNKNOWNS)), np.empty((1, UNKNOWNS))
     for number in numbers:
@@ -282,12 +284,12 @@ def _fit_again(
         pixels, values = lit_by(responses, 0)
         add_light(pixels, values, best[0, 3], residual)
         before = change_by(pixels, values, best[0, 3], residual, observation.weight) + prior_chi2(best, expected)
-        after = fits.one(observation, best, expected, responses, effort)
+        after = fitter.one(observation, best, expected, responses, effort)
         if depths.shape[1] > 0:
             lowest = after - elsewhere.gain
             begin_at(view, particles[number], depths[number], starts)
             choice, limits = elsewhere.choice, (np.inf, lowest)
-            change = fits.best(observation, fits.one, starts, expected, responses, choice, limits, best)
+            change = fitter.best((observation, fitter.one), starts, expected, responses, choice, limits, best)
             if change < lowest:
                 after = change
                 refitted.moved[number] = True
@@ -308,11 +310,11 @@ def other_ends(
     Returned are the ends (n, k, 4), and by how much chi-squared is larger there than where they are (n, k), infinite
     for those that are not chosen. The residual is in place again on return.
     """
-    fits = fits_of(observation)
+    fitter = fitter_of(observation)
     ends, rises = np.zeros((*places.shape[:2], UNKNOWNS)), np.full(places.shape[:2], np.inf)
 
     def work(numbers: NDArray[np.int64]) -> None:
-        _other_ends(observation, fits, particles, numbers[chosen[numbers]], places, effort, ends, rises)
+        _other_ends(fitter, particles, numbers[chosen[numbers]], places, effort, ends, rises)
 
     over_tiles(work, observation.optics, particles, observation.depths_mm)
     return ends, rises
@@ -320,8 +322,7 @@ def other_ends(
 
 @njit(cache=True, nogil=True)
 def _other_ends(
-    observation: Observation,
-    fits: Fits,
+    fitter: Fitter,
     particles: Floats,
     numbers: NDArray[np.int64],
     places: Floats,
@@ -330,6 +331,7 @@ def _other_ends(
     rises: Floats,
 ) -> None:
     """Do the work of `other_ends` for the particles of a tile."""
+    observation = fitter.observation
     view, residual, weight = observation.optics, observation.residual, observation.weight
     responses, prior = room_for(1, observation.capacity, 0), np.zeros((1, 2 * UNKNOWNS))
     for number in numbers:
@@ -345,7 +347,7 @@ def _other_ends(
             observation.respond(view, end, responses)
             pixels, values = lit_by(responses, 0)
             end[0, 3] = best_light(pixels, values, residual, weight)
-            rises[number, k] = fits.one(observation, end, prior, responses, effort) - before
+            rises[number, k] = fitter.one(observation, end, prior, responses, effort) - before
         observation.respond(view, own, responses)
         pixels, values = lit_by(responses, 0)
         add_light(pixels, values, -own[0, 3], residual)
@@ -374,13 +376,13 @@ class Least(NamedTuple):
 
 def accept(observation: Observation, candidates: Floats, least: Least) -> NDArray[np.bool_]:
     """Fit candidates (n, 4) in place, one after the other; return which ones stay, their light off the residual."""
-    accepted, fits = np.zeros(len(candidates), np.bool_), fits_of(observation)
+    accepted, fitter = np.zeros(len(candidates), np.bool_), fitter_of(observation)
     choice = Choice(Effort(FIRST_STEPS, CHOICE_GAIN), Effort(CANDIDATE_STEPS, CHOICE_GAIN), 1, least.light, np.inf)
     depths = candidates[:, 2:3] + START_DEPTHS * observation.optics.scale.depth_mm
     depths = np.clip(depths, observation.low_mm, observation.high_mm)
 
     def work(numbers: NDArray[np.int64]) -> None:
-        _accept(observation, fits, candidates, numbers, choice, depths, least, accepted)
+        _accept(fitter, candidates, numbers, choice, depths, least, accepted)
 
     over_tiles(work, observation.optics, candidates, observation.depths_mm)
     return accepted
@@ -388,8 +390,7 @@ def accept(observation: Observation, candidates: Floats, least: Least) -> NDArra
 
 @njit(cache=True, nogil=True)
 def _accept(
-    observation: Observation,
-    fits: Fits,
+    fitter: Fitter,
     candidates: Floats,
     numbers: NDArray[np.int64],
     choice: Choice,
@@ -398,13 +399,14 @@ def _accept(
     accepted: NDArray[np.bool_],
 ) -> None:
     """Do the work of `accept` for the candidates of a tile."""
+    observation = fitter.observation
     residual, weight = observation.residual, observation.weight
     responses, prior = room_for(1, observation.capacity, 0), np.zeros((1, 2 * UNKNOWNS))
     starts, best = np.empty((depths.shape[1], 1, UNKNOWNS)), np.empty((1, UNKNOWNS))
     for number in numbers:
         begin_at(observation.optics, candidates[number], depths[number], starts)
         limits = 0.0, -least.gain
-        if fits.best(observation, fits.one, starts, prior, responses, choice, limits, best) >= -least.gain:
+        if fitter.best((observation, fitter.one), starts, prior, responses, choice, limits, best) >= -least.gain:
             continue
         observation.respond(observation.optics, best, responses)
         pixels, values = lit_by(responses, 0)

@@ -27,7 +27,7 @@ from scipy.spatial import KDTree
 from lfpiv_cli.arrays import Floats
 from lfpiv_cli.grid import Scale
 from lfpiv_cli.kernels import njit
-from lfpiv_cli.particles.fitting import NO_FURTHER, Choice, Fits, begin_at, fits_of, nothing_expected
+from lfpiv_cli.particles.fitting import NO_FURTHER, Choice, Fitter, begin_at, fitter_of, nothing_expected
 from lfpiv_cli.particles.least_squares import (
     CHOICE_GAIN,
     UNKNOWNS,
@@ -195,13 +195,13 @@ def join(
     (m, 2) of particles (n, 4) are joined, each particle once at most.
     """
     joined, free = np.zeros(len(pairs), np.bool_), np.ones(len(particles), np.bool_)
-    light, fits = particles[pairs, 3:], fits_of(observation)
+    light, fitter = particles[pairs, 3:], fitter_of(observation)
     middle = np.sum(particles[pairs] * light, axis=1) / np.maximum(light.sum(axis=1), np.finfo(np.float64).tiny)
     # Starts lie in the middle: from there fits move no further than tiles allow.
     limits = np.column_stack([largest_loss, brightest])
 
     def work(numbers: NDArray[np.int64]) -> None:
-        joined[numbers] = _join(observation, fits, particles, middle, pairs, numbers, limits, free)
+        joined[numbers] = _join(fitter, particles, middle, pairs, numbers, limits, free)
 
     over_tiles(work, observation.optics, middle, observation.depths_mm)
     return joined
@@ -209,8 +209,7 @@ def join(
 
 @njit(cache=True, nogil=True)
 def _join(
-    observation: Observation,
-    fits: Fits,
+    fitter: Fitter,
     particles: Floats,
     middle: Floats,
     pairs: NDArray[np.int64],
@@ -222,6 +221,7 @@ def _join(
 
     `limits` (m, 2) are the largest loss and the most light, `free` particles that no pair has taken yet.
     """
+    observation = fitter.observation
     view, residual, weight = observation.optics, observation.residual, observation.weight
     responses, prior = room_for(1, observation.capacity, 0), np.zeros((1, 2 * UNKNOWNS))
     depths, starts, best = np.empty(3), np.empty((3, 1, UNKNOWNS)), np.empty((1, UNKNOWNS))
@@ -240,7 +240,7 @@ def _join(
         begin_at(view, middle[number], depths, starts)
         choice = Choice(effort, NO_FURTHER, len(starts), LEAST_LIGHT, limits[number, 1])
         highest = two + limits[number, 0]
-        lowest = fits.best(observation, fits.one, starts, prior, responses, choice, (np.inf, highest), best)
+        lowest = fitter.best((observation, fitter.one), starts, prior, responses, choice, (np.inf, highest), best)
         joined[k] = lowest < highest
         if joined[k]:
             copy_rows(best, particles[first : first + 1])

@@ -14,7 +14,7 @@ from scipy.spatial import KDTree
 from lfpiv_cli.arrays import Floats
 from lfpiv_cli.grid import Scale
 from lfpiv_cli.kernels import njit
-from lfpiv_cli.particles.fitting import NO_FURTHER, Choice, Elsewhere, Fits, fit_again, fits_of
+from lfpiv_cli.particles.fitting import NO_FURTHER, Choice, Elsewhere, Fitter, fit_again, fitter_of
 from lfpiv_cli.particles.least_squares import (
     CHOICE_GAIN,
     UNKNOWNS,
@@ -69,13 +69,13 @@ def split(
     The first of the two takes the suspect's place in `particles` (n, 4); the second ones are returned in an array of
     the same shape whose other rows are zero. The residual is kept up to date.
     """
-    partners, fits = np.zeros_like(particles), fits_of(observation)
+    partners, fitter = np.zeros_like(particles), fitter_of(observation)
     places = footprint_px(observation.optics, *observation.depths_mm) * observation.optics.camera.columns
     first, then = Effort(FIRST_STEPS, CHOICE_GAIN), Effort(PAIR_STEPS, CHOICE_GAIN)
     choice = Choice(first, then, FINALISTS, smallest_light, np.inf)
 
     def work(numbers: NDArray[np.int64]) -> None:
-        _split(observation, fits, particles, numbers[suspects[numbers]], places, choice, smallest_gain, partners)
+        _split(fitter, particles, numbers[suspects[numbers]], places, choice, smallest_gain, partners)
 
     over_tiles(work, observation.optics, particles, observation.depths_mm)
     return partners
@@ -83,8 +83,7 @@ def split(
 
 @njit(cache=True, nogil=True)
 def _split(
-    observation: Observation,
-    fits: Fits,
+    fitter: Fitter,
     particles: Floats,
     numbers: NDArray[np.int64],
     places: int,
@@ -93,6 +92,7 @@ def _split(
     partners: Floats,
 ) -> None:
     """Do the work of `split` for suspects of a tile; `gain` is what two must lower chi-squared by."""
+    observation = fitter.observation
     view, residual, scale = observation.optics, observation.residual, observation.optics.scale
     responses, prior = room_for(2, observation.capacity, places), np.zeros((2, 2 * UNKNOWNS))
     best, starts = np.empty((2, UNKNOWNS)), np.empty((len(STARTS), 2, UNKNOWNS))
@@ -112,7 +112,7 @@ def _split(
                 pair[m, 2] = min(max(depth, observation.low_mm), observation.high_mm)
                 pair[m, 3] = 0.5 * light
         limits = single - FIRST_GAIN * gain, single - gain
-        if fits.best(observation, fits.one, starts, prior, responses, choice, limits, best) < limits[1]:
+        if fitter.best((observation, fitter.one), starts, prior, responses, choice, limits, best) < limits[1]:
             copy_rows(best[:1], one)
             copy_rows(best[1:], partners[number : number + 1])
             observation.respond(view, best, responses)
