@@ -50,7 +50,8 @@ CALIBRATE = ("calibrate-snapshot", CONFIG, "--white", SAMPLE / "white.tif")
 def test_a_reference_without_counts_is_refused(
     tmp_path: Path, weights: Path, command: str, option: str, value: float
 ) -> None:
-    image, target = picture(tmp_path / "reference.tif", value), tmp_path / "out.h5"
+    image = picture(tmp_path / "reference.tif", value)
+    target = tmp_path / ("out.h5" if command == "calibrate" else "out.vtkhdf")
     words = CALIBRATE if command == "calibrate" else ("reconstruct", weights, SAMPLE / "pair_a.tif")
     code, said = ended(*words, option, image, "-o", target)
     assert (code, "reference.tif: 1 of its 268800 pixels are not counts" in said) == (4, True), said
