@@ -1,4 +1,4 @@
-"""Compiled functions: numba's, in about half the time.
+"""Compiled functions: numba's, which take less time to compile.
 
 A function that Python calls begins with code that takes apart each array and tuple it is given; compiling that takes
 as long as the rest of a short one, and kernels that call it have no use for it. So a kernel is compiled for Python and

@@ -9,8 +9,8 @@ pixels side by side. With H the normal matrix, K = H^-1 J^T W^(1/2) is how far e
 and errors with the correlation R move it by the covariance K R K^T. What a particle's chi-squared exceeds 1 by is not
 noise but such a sign: it counts as errors that are all alike.
 
-Two particles whose light is hardly told apart may share it otherwise: with I the light of one, d how far they are apart
-and c the covariance of their light, it moves by -c / I^2 d, of second order in what their light is uncertain by.
+Two particles whose light is hardly distinguished may share it otherwise: with I the light of one, d how far they are
+apart and c the covariance of their light, it moves by -c / I^2 d, of second order in what their light is uncertain by.
 
 What is wrong with the light of all particles together, as their size is, moves each by -H^-1 J^T W d with d what the
 image changes by.

@@ -545,7 +545,7 @@ def _fit_each(
     fitted: NDArray[np.float64],
 ) -> None:
     """Do the work of `_fitted` for the tracers of a tile."""
-    residual, sized = observation.residual, fitter.observation
+    residual, (sized, _) = observation.residual, fitter.to
     own, responses = room_for(1, observation.capacity, 0), room_for(1, sized.capacity, 0)
     starts, prior = np.empty((depths_mm.shape[1], 1, UNKNOWNS)), np.zeros((1, 2 * UNKNOWNS))
     effort = Effort(STEPS, SMALLEST_GAIN)
@@ -556,5 +556,5 @@ def _fit_each(
         add_light(pixels, values, tracers[number, 3], residual)
         begin_at(sized.optics, tracers[number], depths_mm[number], starts)
         best = fitted[number : number + 1]
-        change[number] = fitter.best((sized, fitter.one), starts, prior, responses, choice, (0.0, 0.0), best)
+        change[number] = fitter.best(fitter.to, starts, prior, responses, choice, (0.0, 0.0), best)
         add_light(pixels, values, -tracers[number, 3], residual)

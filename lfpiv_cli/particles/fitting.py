@@ -188,22 +188,20 @@ class Fitter(NamedTuple):
 
     Attributes
     ----------
-    observation : what is fitted to
-    one : `least_squares.fit`
+    to : what is fitted to, and `least_squares.fit`
     best : `fit_best`
     """
 
-    observation: Observation
-    one: Fit
+    to: tuple[Observation, Fit]
     best: Callable[[tuple[Observation, Fit], Floats, Floats, Responses, Choice, tuple[float, float], Floats], float]
 
 
 def fitter_of(observation: Observation) -> Fitter:
     """Return what fits particles to an observation."""
     responses, starts = room_for(1, 1, 0), np.empty((0, 0, UNKNOWNS))
-    one = by_address(fit, float64, observation, NO_ROWS, NO_ROWS, responses, NO_FURTHER)
-    of_best = (observation, one), starts, NO_ROWS, responses, NOWHERE_ELSE, (0.0, 0.0), NO_ROWS
-    return Fitter(observation, one, by_address(fit_best, float64, *of_best))
+    to = observation, by_address(fit, float64, observation, NO_ROWS, NO_ROWS, responses, NO_FURTHER)
+    of_best = starts, NO_ROWS, responses, NOWHERE_ELSE, (0.0, 0.0), NO_ROWS
+    return Fitter(to, by_address(fit_best, float64, to, *of_best))
 
 
 class Refitted(NamedTuple):
@@ -273,7 +271,7 @@ def _fit_again(
     refitted: Refitted,
 ) -> None:
     """Do the work of `fit_again` for the particles of a tile."""
-    observation, depths = fitter.observation, elsewhere.depths_mm
+    (observation, fit_one), depths = fitter.to, elsewhere.depths_mm
     view, residual = observation.optics, observation.residual
     responses = room_for(1, observation.capacity, 0)
     starts, best = np.empty((depths.shape[1], 1, UNKNOWNS)), np.empty((1, UNKNOWNS))
@@ -284,12 +282,12 @@ def _fit_again(
         pixels, values = lit_by(responses, 0)
         add_light(pixels, values, best[0, 3], residual)
         before = change_by(pixels, values, best[0, 3], residual, observation.weight) + prior_chi2(best, expected)
-        after = fitter.one(observation, best, expected, responses, effort)
+        after = fit_one(observation, best, expected, responses, effort)
         if depths.shape[1] > 0:
             lowest = after - elsewhere.gain
             begin_at(view, particles[number], depths[number], starts)
             choice, limits = elsewhere.choice, (np.inf, lowest)
-            change = fitter.best((observation, fitter.one), starts, expected, responses, choice, limits, best)
+            change = fitter.best(fitter.to, starts, expected, responses, choice, limits, best)
             if change < lowest:
                 after = change
                 refitted.moved[number] = True
@@ -331,7 +329,7 @@ def _other_ends(
     rises: Floats,
 ) -> None:
     """Do the work of `other_ends` for the particles of a tile."""
-    observation = fitter.observation
+    observation, fit_one = fitter.to
     view, residual, weight = observation.optics, observation.residual, observation.weight
     responses, prior = room_for(1, observation.capacity, 0), np.zeros((1, 2 * UNKNOWNS))
     for number in numbers:
@@ -347,7 +345,7 @@ def _other_ends(
             observation.respond(view, end, responses)
             pixels, values = lit_by(responses, 0)
             end[0, 3] = best_light(pixels, values, residual, weight)
-            rises[number, k] = fitter.one(observation, end, prior, responses, effort) - before
+            rises[number, k] = fit_one(observation, end, prior, responses, effort) - before
         observation.respond(view, own, responses)
         pixels, values = lit_by(responses, 0)
         add_light(pixels, values, -own[0, 3], residual)
@@ -399,14 +397,14 @@ def _accept(
     accepted: NDArray[np.bool_],
 ) -> None:
     """Do the work of `accept` for the candidates of a tile."""
-    observation = fitter.observation
+    observation, _ = fitter.to
     residual, weight = observation.residual, observation.weight
     responses, prior = room_for(1, observation.capacity, 0), np.zeros((1, 2 * UNKNOWNS))
     starts, best = np.empty((depths.shape[1], 1, UNKNOWNS)), np.empty((1, UNKNOWNS))
     for number in numbers:
         begin_at(observation.optics, candidates[number], depths[number], starts)
         limits = 0.0, -least.gain
-        if fitter.best((observation, fitter.one), starts, prior, responses, choice, limits, best) >= -least.gain:
+        if fitter.best(fitter.to, starts, prior, responses, choice, limits, best) >= -least.gain:
             continue
         observation.respond(observation.optics, best, responses)
         pixels, values = lit_by(responses, 0)

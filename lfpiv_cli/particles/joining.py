@@ -221,7 +221,7 @@ def _join(
 
     `limits` (m, 2) are the largest loss and the most light, `free` particles that no pair has taken yet.
     """
-    observation = fitter.observation
+    observation, _ = fitter.to
     view, residual, weight = observation.optics, observation.residual, observation.weight
     responses, prior = room_for(1, observation.capacity, 0), np.zeros((1, 2 * UNKNOWNS))
     depths, starts, best = np.empty(3), np.empty((3, 1, UNKNOWNS)), np.empty((1, UNKNOWNS))
@@ -240,7 +240,7 @@ def _join(
         begin_at(view, middle[number], depths, starts)
         choice = Choice(effort, NO_FURTHER, len(starts), LEAST_LIGHT, limits[number, 1])
         highest = two + limits[number, 0]
-        lowest = fitter.best((observation, fitter.one), starts, prior, responses, choice, (np.inf, highest), best)
+        lowest = fitter.best(fitter.to, starts, prior, responses, choice, (np.inf, highest), best)
         joined[k] = lowest < highest
         if joined[k]:
             copy_rows(best, particles[first : first + 1])

@@ -92,7 +92,7 @@ def _split(
     partners: Floats,
 ) -> None:
     """Do the work of `split` for suspects of a tile; `gain` is what two must lower chi-squared by."""
-    observation = fitter.observation
+    observation, _ = fitter.to
     view, residual, scale = observation.optics, observation.residual, observation.optics.scale
     responses, prior = room_for(2, observation.capacity, places), np.zeros((2, 2 * UNKNOWNS))
     best, starts = np.empty((2, UNKNOWNS)), np.empty((len(STARTS), 2, UNKNOWNS))
@@ -112,7 +112,7 @@ def _split(
                 pair[m, 2] = min(max(depth, observation.low_mm), observation.high_mm)
                 pair[m, 3] = 0.5 * light
         limits = single - FIRST_GAIN * gain, single - gain
-        if fitter.best((observation, fitter.one), starts, prior, responses, choice, limits, best) < limits[1]:
+        if fitter.best(fitter.to, starts, prior, responses, choice, limits, best) < limits[1]:
             copy_rows(best[:1], one)
             copy_rows(best[1:], partners[number : number + 1])
             observation.respond(view, best, responses)

@@ -12,6 +12,7 @@ from __future__ import annotations
 import json
 import shutil
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass, field
@@ -106,7 +107,7 @@ class Expected:
     memory_bytes: float | None = None
 
 
-class Batch(Generic[Made]):
+class Batch(ABC, Generic[Made]):
     """Outputs that are made one after the other, each from inputs of its own.
 
     Another process makes it again from its arguments: these are sent, and not what it holds.
@@ -169,6 +170,7 @@ class Batch(Generic[Made]):
         """Prepare what the outputs of these numbers share, to be made in their order; return the steps of each."""
         return 1.0
 
+    @abstractmethod
     def make(self, number: int, work: Frames) -> Made:
         """Make and write an output.
 
@@ -176,7 +178,6 @@ class Batch(Generic[Made]):
         ------
         InputError : one of its inputs cannot be read, or does not belong with the others
         """
-        raise NotImplementedError
 
     def attempt(self, number: int, before: Stamp, work: Frames) -> Made | Turn:
         """Make an output, unless another worker does or did; `before` is what was in its place when the batch began.
