@@ -99,12 +99,12 @@ class Browser:
                 assert piece, "the browser has gone"
                 self._rest += piece
             message, _, self._rest = self._rest.partition(b"\0")
-            told = json.loads(message)
-            if "method" in told:
-                self.events.append(told["method"])
-                if told["method"] == "Network.requestWillBeSent":
-                    self.requests.append(told["params"]["request"]["url"])
-            yield told
+            reported = json.loads(message)
+            if "method" in reported:
+                self.events.append(reported["method"])
+                if reported["method"] == "Network.requestWillBeSent":
+                    self.requests.append(reported["params"]["request"]["url"])
+            yield reported
 
 
 @contextmanager

@@ -24,7 +24,7 @@ def run(*arguments: object) -> None:
     cli.main([str(argument) for argument in arguments], standalone_mode=False)
 
 
-def told(capsys: pytest.CaptureFixture[str], *arguments: object) -> dict[str, Any]:
+def summary_of(capsys: pytest.CaptureFixture[str], *arguments: object) -> dict[str, Any]:
     """Run a command; return its summary."""
     capsys.readouterr()
     try:

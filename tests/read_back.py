@@ -117,9 +117,9 @@ def by_vtk(path: Path, content: Content) -> None:
     reader.Update()
     assert reader.GetErrorCode() == 0
     data = reader.GetOutput()
-    told = data.GetFieldData()
-    ensure_record(told.GetAbstractArray("provenance").GetValue(0), content)
-    assert told.GetArray("reference_z_mm").GetValue(0) == content.attributes["reference_z_mm"]
+    reported = data.GetFieldData()
+    ensure_record(reported.GetAbstractArray("provenance").GetValue(0), content)
+    assert reported.GetArray("reference_z_mm").GetValue(0) == content.attributes["reference_z_mm"]
     if content.grid is not None:
         place = data.GetDimensions(), data.GetOrigin(), data.GetSpacing()
         assert place == (content.grid.shape_xyz, content.grid.origin_mm, content.grid.spacing_mm)

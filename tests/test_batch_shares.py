@@ -154,8 +154,8 @@ def test_frames_that_come(
     camera = Filling(tmp_path / "run", {1.0: frames[0], 2.0: frames[1], 14.0: frames[2]})
     monkeypatch.setattr(batch, "time", camera)
     alone(weights, [camera.folder], tmp_path / "v", "--watch", "--idle-s", 20, "--json")
-    told = json.loads(capsys.readouterr().out)
-    assert (told["frames"], told["reconstructed"]) == (3, 3)
+    reported = json.loads(capsys.readouterr().out)
+    assert (reported["frames"], reported["reconstructed"]) == (3, 3)
     alone(weights, frames[:3], tmp_path / "one")
     assert contents(tmp_path / "v") == contents(tmp_path / "one")
     # once more, with one that never becomes whole

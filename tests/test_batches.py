@@ -20,7 +20,7 @@ from lfpiv_cli.files import atomic
 from lfpiv_cli.files.atomic import DEAD_AFTER_S, EventLog, claim_path, claimed, ignores_case
 from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, read_points
 from lfpiv_cli.files.vtkhdf import open_volume
-from tests.commands import CONFIG, ROOT, SAMPLE, run, sample_weights, told
+from tests.commands import CONFIG, ROOT, SAMPLE, run, sample_weights, summary_of
 
 QUICK = ("--iterations", 1, "--dark", SAMPLE / "dark.tif")
 
@@ -44,12 +44,12 @@ def spoil(path: Path, kind: str) -> None:
 @pytest.mark.thorough
 def test_a_finished_batch_is_skipped_and_stays_as_it_is(weights, images, tmp_path, capsys) -> None:
     command = ("reconstruct", weights, *images, *QUICK, "-o", tmp_path / "out")
-    assert told(capsys, *command)["reconstructed"] == 3
+    assert summary_of(capsys, *command)["reconstructed"] == 3
     before = stamps(tmp_path / "out")
     assert sorted(before) == ["f0.vtkhdf", "f1.vtkhdf", "f2.vtkhdf"]
     with pytest.raises(OutputExistsError):
         run(*command)
-    again = told(capsys, *command, "--resume")
+    again = summary_of(capsys, *command, "--resume")
     assert (again["reconstructed"], again["skipped"]) == (0, 3)
     with pytest.raises(OutputExistsError, match="other inputs or settings"):
         run(*command, "--resume", "--iterations", 3)
@@ -71,7 +71,7 @@ def test_a_damaged_result_is_made_anew(weights, images, tmp_path, capsys) -> Non
         else:
             content[at] ^= 0x10
         damaged.write_bytes(content)
-        summary = told(capsys, *command, "--resume")
+        summary = summary_of(capsys, *command, "--resume")
         assert (summary["reconstructed"], summary["skipped"]) == (1, 1)
         after = stamps(tmp_path / "out")
         assert after["f0.vtkhdf"] == before["f0.vtkhdf"]
@@ -153,13 +153,13 @@ def test_a_bad_frame_is_left_out_of_the_background_of_others(weights, images, ra
 def test_a_finished_mean_is_kept(pairs, tmp_path, capsys) -> None:
     mean = tmp_path / "mean.vtkhdf"
     command = ("correlate", *pairs, "--pairing", "ab", "--windows", 8, "--mean", mean, "-o", tmp_path / "out")
-    assert told(capsys, *command)["skipped"] == 0
+    assert summary_of(capsys, *command)["skipped"] == 0
     before, at = stamps(tmp_path / "out"), mean.stat().st_mtime_ns
-    assert told(capsys, *command, "--resume")["skipped"] == 2
+    assert summary_of(capsys, *command, "--resume")["skipped"] == 2
     assert (stamps(tmp_path / "out"), mean.stat().st_mtime_ns) == (before, at)
     # a damaged field is made again as it was, and the mean of the same fields stays
     (tmp_path / "out" / "a1.vtkhdf").write_bytes(before["a1.vtkhdf"][1][:-9])
-    assert told(capsys, *command, "--resume")["skipped"] == 1
+    assert summary_of(capsys, *command, "--resume")["skipped"] == 1
     assert mean.stat().st_mtime_ns == at
     third = [path.with_name(f"{name}2.vtkhdf") for name, path in zip("ab", pairs, strict=False)]
     for path, other in zip(third, pairs, strict=False):
@@ -202,7 +202,7 @@ def test_what_another_worker_makes_is_left_to_it(weights, images, tmp_path, caps
     claiming, worker = threading.Event(), threading.Thread(target=other)
     worker.start()
     assert claiming.wait(10)
-    summary = told(capsys, *command, out)
+    summary = summary_of(capsys, *command, out)
     worker.join()
     assert (summary["reconstructed"], summary["skipped"]) == (2, 1)
     assert sorted(stamps(out)) == ["f0.vtkhdf", "f1.vtkhdf", "f2.vtkhdf"]
@@ -218,7 +218,10 @@ def test_the_claim_of_a_dead_worker_is_taken_over(weights, images, tmp_path, cap
     claim.write_text("" if fate == "half written" else json.dumps({"host": host, "process": dead.pid}))
     if fate != "dead":
         os.utime(claim, (time.time() - 2 * DEAD_AFTER_S,) * 2)
-    assert told(capsys, "reconstruct", weights, images[0], *QUICK, "-o", tmp_path / "f0.vtkhdf")["reconstructed"] == 1
+    assert (
+        summary_of(capsys, "reconstruct", weights, images[0], *QUICK, "-o", tmp_path / "f0.vtkhdf")["reconstructed"]
+        == 1
+    )
     assert not claims_in(tmp_path)
 
 
@@ -309,7 +312,9 @@ def test_a_pair_with_a_bad_frame_stays_as_it_is(tmp_path, capsys) -> None:
     with pytest.raises(PartialError):
         run(*beside, "--keep-going")
     assert stamps(out) == before
-    summary = told(capsys, "reconstruct", tmp_path / "weights.h5", images[1], *dark, "-o", tmp_path / "alone.vtkhdf")
+    summary = summary_of(
+        capsys, "reconstruct", tmp_path / "weights.h5", images[1], *dark, "-o", tmp_path / "alone.vtkhdf"
+    )
     assert summary["particle_diameter_measured_mm"] == pytest.approx(0.05, rel=0.2)
     found, alone = (read_points(path, PARTICLES_FORMAT) for path in (out / "pair_b.vtkhdf", tmp_path / "alone.vtkhdf"))
     np.testing.assert_array_equal(found.position_mm, alone.position_mm)
@@ -352,7 +357,7 @@ def test_a_dry_run_tells_and_writes_nothing(weights, images, pairs, tmp_path, ca
     }[command]
     words = (command, *given, "-o", tmp_path / "out", "--failures", tmp_path / "failed.json")
     before = stamps(tmp_path)
-    summary = told(capsys, *words, "--log", tmp_path / "log", "--dry-run")
+    summary = summary_of(capsys, *words, "--log", tmp_path / "log", "--dry-run")
     assert stamps(tmp_path) == before
     made = ["f0", "f1", "f2"] if command == "reconstruct" else ["a0", "a1"]
     assert (summary["to_make"], summary["skipped"], summary["unreadable"]) == (len(made), 0, 0)
@@ -374,7 +379,7 @@ def test_a_dry_run_believes_what_is_there_and_the_log(weights, images, tmp_path,
     victim.unlink()
     before = [json.loads(line) for line in (tmp_path / "log").read_text().splitlines()]
     frames = [each for each in before if each["event"] == "frame"]
-    summary = told(capsys, *command, "--dry-run")
+    summary = summary_of(capsys, *command, "--dry-run")
     assert [json.loads(line) for line in (tmp_path / "log").read_text().splitlines()] == before
     assert (summary["to_make"], summary["skipped"]) == (1, 2)
     assert summary["would_make"] == [str(victim)]
@@ -397,7 +402,7 @@ def test_a_dry_run_ends_as_the_batch_would(weights, images, pairs, tmp_path, cap
     spoil(images[0], "empty")
     with pytest.raises(InputError, match="f0.tif: is empty"):
         run("reconstruct", weights, *images, *QUICK, *output)
-    summary = told(
+    summary = summary_of(
         capsys, "reconstruct", weights, *images, *QUICK, *output[:2], "--keep-going", "--resume", "--dry-run"
     )
     assert (summary["to_make"], summary["skipped"], summary["unreadable"]) == (0, 2, 1)
@@ -413,7 +418,7 @@ def test_a_dry_run_ends_as_the_batch_would(weights, images, pairs, tmp_path, cap
         "-o",
         tmp_path / "two",
     )
-    summary = told(capsys, *command, "--keep-going", "--dry-run")
+    summary = summary_of(capsys, *command, "--keep-going", "--dry-run")
     assert (summary["to_make"], summary["unreadable"]) == (1, 1)
 
 

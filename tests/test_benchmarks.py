@@ -376,7 +376,7 @@ def test_failures_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caps
     monkeypatch.setitem(READERS, "toy", Reader(".bin", lambda: {"one": b"\1"}, damaged, first_byte, True))
     with pytest.raises(SystemExit):
         bench_fuzz(["toy", "--cases", "40", "--failures", str(tmp_path)])
-    told = capsys.readouterr().out
-    assert "traceback ZeroDivisionError" in told
-    assert all(f"'{kind}'" in told for kind in ("clean", "refused", "traceback", "silent"))
+    reported = capsys.readouterr().out
+    assert "traceback ZeroDivisionError" in reported
+    assert all(f"'{kind}'" in reported for kind in ("clean", "refused", "traceback", "silent"))
     assert {path.read_bytes() for path in tmp_path.iterdir()} == {b"\0", b"\2"}

@@ -298,8 +298,8 @@ def test_fitted_rays_meet_the_array_where_traced_ones_do_eq_1(
     if column_axis == "y":
         seen_by = replace(seen_by, columns=440, rows=520)
     places = [BoardPlacement(z, (0.05, -0.03), rotation_deg=1.5) for z in DEPTHS]
-    told = replace(seen_by, distortion_per_mm2=0.0)  # the data sheet knows nothing of it
-    fit = fit_rays(pictures(seen_by, water, rng, places), DEPTHS, told, SMALL_BOARD, water)
+    reported = replace(seen_by, distortion_per_mm2=0.0)  # the data sheet knows nothing of it
+    fit = fit_rays(pictures(seen_by, water, rng, places), DEPTHS, reported, SMALL_BOARD, water)
     assert fit.rays.degree == 3
     assert fit.sightings > 13_900  # of 14,160: 20 dots, 4 boards, 177 views
     points = seen_by.to_image_axes(rng.uniform((-0.8, -0.5, -4.0), (0.8, 0.5, 5.0), (500, 3)))
@@ -314,14 +314,14 @@ def test_fitted_rays_meet_the_array_where_traced_ones_do_eq_1(
 @pytest.mark.thorough
 def test_boards_at_several_depths_show_the_pupil(table2: Camera, water: Media, rng: np.random.Generator) -> None:
     """A lens of P = 1.3, told as a thin one: its entrance pupil is 100 (1/1.3 + 1) = 176.9 mm away, not 200."""
-    told = replace(sensor_of(table2), aperture_mm=22.0)
-    seen_by = thin_lens(told, 1.0 / 1.3)
+    reported = replace(sensor_of(table2), aperture_mm=22.0)
+    seen_by = thin_lens(reported, 1.0 / 1.3)
     images = pictures(seen_by, water, rng, [BoardPlacement(z, (0.05, -0.03)) for z in DEPTHS])
-    told = told.with_micro_images(seen_by.micro_image_lattice_px())  # as a white image has it
-    fit = fit_rays(images, DEPTHS, told, SMALL_BOARD, water)
+    reported = reported.with_micro_images(seen_by.micro_image_lattice_px())  # as a white image has it
+    fit = fit_rays(images, DEPTHS, reported, SMALL_BOARD, water)
     assert 0.3 < fit.entrance_pupil_sigma_mm < 1.5
     assert fit.entrance_pupil_mm == pytest.approx(100.0 / 1.3 + 100.0, abs=2.0 * fit.entrance_pupil_sigma_mm)
-    camera = fit.behind_its_pupil(told)
+    camera = fit.behind_its_pupil(reported)
     assert camera.focus_distance_mm == pytest.approx(fit.entrance_pupil_mm, rel=1e-12)
     assert fit.behind_its_pupil(camera) is camera
     points = rng.uniform((-0.8, -0.5, -4.0), (0.8, 0.5, 5.0), (500, 3))
@@ -330,7 +330,7 @@ def test_boards_at_several_depths_show_the_pupil(table2: Camera, water: Media, r
     # The crossings of the thin lens are an eighth too far out: rays were off by 7 um.
     error = fit.rays.on_array(points, lens) - truth
     assert np.sqrt(np.mean(error**2)) < 0.9e-3
-    (notice,) = entrance_pupil_notices(fit.entrance_pupil_mm, fit.entrance_pupil_sigma_mm, told)
+    (notice,) = entrance_pupil_notices(fit.entrance_pupil_mm, fit.entrance_pupil_sigma_mm, reported)
     assert "pupil_ratio (1.3 if all else is right)" in notice.remedy
 
 
@@ -398,9 +398,9 @@ def test_from_boards_at_depths_to_columns(
         tifffile.imwrite(path, np.rint(image).astype(np.uint16))
         boards += ["--board", path, "--depth-mm", z]
     assert ended("calibrate-snapshot", rig, *boards, "-o", tmp_path / "c.h5") == (0, "")
-    columns, told = [], ("build-weights", rig, "--calibration", tmp_path / "c.h5")
+    columns, reported = [], ("build-weights", rig, "--calibration", tmp_path / "c.h5")
     for method in ("ert", "dlfc"):
-        assert ended(*told, "--method", method, "-o", tmp_path / method) == (0, "")
+        assert ended(*reported, "--method", method, "-o", tmp_path / method) == (0, "")
         weights = open_weights(tmp_path / method)
         assert not weights.weights.on_demand
         columns.append(column_image(weights, 2, 1, 3))

@@ -20,7 +20,7 @@ from lfpiv_cli.files.config import load_rig
 from lfpiv_cli.files.images import write_tiff
 from lfpiv_cli.files.particle_file import read_particles
 from lfpiv_cli.files.vtkhdf import open_vectors, open_volume
-from tests.commands import CONFIG, SAMPLE, run, told
+from tests.commands import CONFIG, SAMPLE, run, summary_of
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +47,7 @@ def truth(name: str) -> dict:
 @pytest.mark.thorough
 def test_calibration_finds_what_was_simulated(chain, capsys) -> None:
     pictures = [word for name in ("white", "dark", "board") for word in (f"--{name}", SAMPLE / f"{name}.tif")]
-    found, true = told(capsys, "calibrate-snapshot", CONFIG, *pictures, "-o", chain / "c.h5"), truth("board")
+    found, true = summary_of(capsys, "calibrate-snapshot", CONFIG, *pictures, "-o", chain / "c.h5"), truth("board")
     # The bounds asked of the full-size experiment, from a fifteenth of its lenses.
     assert found["rotation_deg"] == pytest.approx(true["rotation_deg"], abs=0.01)
     assert np.allclose(found["origin_px"], true["origin_px"], atol=0.2)

@@ -43,8 +43,8 @@ class Experiment:
         offset = (np.asarray(true["shift_px"]) * shift + moved_px) * true["pixel"]
         lattice = Lattice.regular(true["pitch"], "square", rotation * np.deg2rad(true["rotation_deg"]), offset)
         optics, sensor = ("M", "F", "aperture", "f_ml", "s_mu"), ("pixel", "cols", "rows")
-        told = [*(true[name] for name in optics), lattice, *(true[name] for name in sensor)]
-        return Camera(*told, distortion_per_mm2=distortion * true["k1"])
+        reported = [*(true[name] for name in optics), lattice, *(true[name] for name in sensor)]
+        return Camera(*reported, distortion_per_mm2=distortion * true["k1"])
 
     def window(self):
         return Window(self.truth["window_distance_mm"], self.truth["wall_mm"])

@@ -163,9 +163,9 @@ def test_vectors_are_counted_as_they_are_made(shape: tuple[int, int, int], keys:
     bench, light = bench_of(settings_of(tree), None), np.random.default_rng(1).random(shape[::-1])
     made = list(correlate(light, light, voxel_mm=bench.grid.spacing_mm, **keys).grid.shape_xyz)
     assert rig_figures(bench)["vectors_xyz"] == made
-    (told,) = (line for line in rig_lines(bench) if line.about == "windows")
-    assert f"give {made[0]} x {made[1]} x {made[2]} vectors" in told.reason
-    assert (told.verdict == "no") == ("do not fit" in told.reason) == (shape[1] == 13)
+    (reported,) = (line for line in rig_lines(bench) if line.about == "windows")
+    assert f"give {made[0]} x {made[1]} x {made[2]} vectors" in reported.reason
+    assert (reported.verdict == "no") == ("do not fit" in reported.reason) == (shape[1] == 13)
 
 
 # A corner of Table 2's sensor; the whole chain of figures on it takes seconds.
@@ -251,8 +251,8 @@ class Photographer:
     def verdicts(self, image: Image) -> dict[str, str]:
         """Return what is said of an image beside a white and a dark one."""
         found, lines = self.lattice
-        told, _ = image_lines(bench_of(self.settings, found), Pictures({"a.tif": image}, None, self.cap_on), found)
-        return verdicts([*lines, *told])
+        reported, _ = image_lines(bench_of(self.settings, found), Pictures({"a.tif": image}, None, self.cap_on), found)
+        return verdicts([*lines, *reported])
 
 
 @pytest.fixture(scope="module")
@@ -305,8 +305,8 @@ def test_a_white_image_of_another_camera_is_told(take: Photographer) -> None:
     pictures = Pictures({"a.tif": take.tracers(0.1)}, take.white(other), take.cap_on)
     found, lines = lattice_of(take.settings, pictures)
     assert verdicts(lines)["white image"] == "no"
-    told, _ = image_lines(bench_of(take.settings, found), pictures, found)
-    assert verdicts(told)["drift"] == "unknown"
+    reported, _ = image_lines(bench_of(take.settings, found), pictures, found)
+    assert verdicts(reported)["drift"] == "unknown"
 
 
 @pytest.mark.thorough
@@ -345,7 +345,7 @@ def test_errors_are_those_that_are_measured() -> None:
     search, rng = Case(rig, rig, (2.6, 2.6, 8.4)), np.random.default_rng(3)
     depths, rays = np.array([-4.0, -2.5, 1.5, 3.0]), 400_000
     seen = in_miniature(camera, WATER, depths, 0.025)
-    told = errors_by_depth_mm(seen, Tracer(5e5, 0.025, READOUT), 5e5 / rays)
+    reported = errors_by_depth_mm(seen, Tracer(5e5, 0.025, READOUT), 5e5 / rays)
     ratios = []
     for _ in range(4):
         x, y = (each.ravel() for each in np.meshgrid([-0.85, 0.0, 0.85], [-0.85, 0.0, 0.85]))
@@ -356,7 +356,7 @@ def test_errors_are_those_that_are_measured() -> None:
         image = READOUT.record(render_points(camera, rig.space, balls, rng, rays=rays), rng)
         pairs = pairs_of(search.particles(image.astype(np.float32) - np.float32(96.0)), points, 0.03)
         assert len(pairs.true) == x.size
-        ratios.append(pairs.error_voxel / told[layer[pairs.true]])
+        ratios.append(pairs.error_voxel / reported[layer[pairs.true]])
     lateral, depth = np.concatenate(ratios)[:, :2], np.concatenate(ratios)[:, 2]
     # Of 36 tracers a standard deviation is known to an eighth.
     assert np.sqrt(np.mean(lateral**2)) == pytest.approx(1.0, abs=0.3)
@@ -370,12 +370,12 @@ def test_the_command_tells_all(tmp_path: Path) -> None:
     write_tiff(image, Photographer().tracers().astype(np.uint16), False)
     done = CliRunner().invoke(cli, ["check", str(rig), str(image), "--picture", str(picture), "--json"])
     assert done.exit_code == 0, done.output
-    told = json.loads(done.stdout)
+    reported = json.loads(done.stdout)
     # Windows that fit into so small a volume hold few tracers, and the rig is by rays.
-    assert {line["about"] for line in told["verdicts"] if line["verdict"] == "look"} == {"windows", "diffraction"}
-    assert told["verdict"] == "look"
-    assert {line["about"] for line in told["verdicts"]} >= {"field of view", "time step", "exposure", "tracers"}
-    assert told["best_dt_s"] == pytest.approx(5 * 0.1 / 3 / told["expected_velocity_m_s"] / 1e3, rel=0.05)
+    assert {line["about"] for line in reported["verdicts"] if line["verdict"] == "look"} == {"windows", "diffraction"}
+    assert reported["verdict"] == "look"
+    assert {line["about"] for line in reported["verdicts"]} >= {"field of view", "time step", "exposure", "tracers"}
+    assert reported["best_dt_s"] == pytest.approx(5 * 0.1 / 3 / reported["expected_velocity_m_s"] / 1e3, rel=0.05)
     assert picture.read_bytes().startswith(b"\x89PNG")
     faster = CliRunner().invoke(cli, ["check", str(rig), "--velocity-m-s", "10"])
     assert faster.exit_code == 0

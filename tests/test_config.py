@@ -229,8 +229,8 @@ def test_lengths_follow_from_f_numbers_pupils_and_the_image_distance(write, tabl
     assert (camera.focal_length_mm, camera.aperture_mm) == (100.0, 25.0)
     assert camera.microlens_distance_mm == camera.microlens_focal_length_mm == pytest.approx(0.8)
     # With P = 1.25 the array lies 100 (1.25 + 1) mm behind the exit pupil, the focus 180 mm before the entrance.
-    for told in ("focal_length_mm: 100, pupil_ratio: 1.25", "image_distance_mm: 225, pupil_ratio: 1.25"):
-        camera = load_rig(write(RIG.replace("focal_length_mm: 100.0", told))).camera_model()
+    for reported in ("focal_length_mm: 100, pupil_ratio: 1.25", "image_distance_mm: 225, pupil_ratio: 1.25"):
+        camera = load_rig(write(RIG.replace("focal_length_mm: 100.0", reported))).camera_model()
         assert camera.focus_distance_mm == pytest.approx(180.0)
         assert camera.micro_image_lattice_px().pitch * 5.5 == pytest.approx(100.0 * (1.0 + 0.8 / 225.0))
         assert camera.aperture_mm == 25.0

@@ -107,8 +107,8 @@ def test_the_log_has_a_line_for_each_event_whatever_is_silent(clock: Clock, tmp_
     assert warning["code"] == "odd"
     memory = frame.pop("memory_mb")
     assert memory is None or 10.0 < memory < 1e5
-    told = {"command": "reconstruct", "event": "frame", "step": "reconstruct", "name": "a", "done": 1, "of": 2}
-    assert frame | {"time": 0, "process": 0} == told | dict.fromkeys(("time", "process"), 0) | {
+    reported = {"command": "reconstruct", "event": "frame", "step": "reconstruct", "name": "a", "done": 1, "of": 2}
+    assert frame | {"time": 0, "process": 0} == reported | dict.fromkeys(("time", "process"), 0) | {
         "seconds_each": 3.0,
         "seconds_left": 3.0,
     }

@@ -364,13 +364,13 @@ def test_a_volume_behind_a_tube_is_reconstructed(tube, tmp_path, monkeypatch, la
     volume = {"shape_xyz": [6, 20, 6], "voxel_mm": [0.1, 0.1, 0.5], "centre_mm": [0.0, 1.5, 3.5]}
     solver = {"solver": "em", "iterations": 30}
     rig.write_text(table2_rig(360, 1200, layout, volume=volume, reconstruction=solver))
-    told = build_weights_file(rig, output)
+    reported = build_weights_file(rig, output)
     weights = open_weights(output)
-    assert told["voxels_outside_fluid"] == weights.weights.voxels_outside_fluid > 0
+    assert reported["voxels_outside_fluid"] == weights.weights.voxels_outside_fluid > 0
     if layout == "square":
-        assert told["column_misfit_l1_median"] <= told["column_misfit_l1_largest"] < 0.035
+        assert reported["column_misfit_l1_median"] <= reported["column_misfit_l1_largest"] < 0.035
     else:
-        assert told["ray_misfit_mm"] < 1e-5
+        assert reported["ray_misfit_mm"] < 1e-5
     assert isinstance(weights.weights.solver_operator, StripOperator if layout == "square" else OnDemandOperator)
     volume = np.zeros(weights.shape, np.float32)
     volume[2, 13, 3] = 1000.0

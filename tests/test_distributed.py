@@ -166,11 +166,11 @@ class Ending(Toy):
 def test_workers_elsewhere_and_a_scheduler_that_ends(tmp_path: Path) -> None:
     tests = Path(__file__).parent
     environment = os.environ | {"PYTHONPATH": f"{tests.parent}{os.pathsep}{tests}"}
-    told = ["--scheduler-file", str(tmp_path / "told.json")]
+    reported = ["--scheduler-file", str(tmp_path / "told.json")]
     with contextlib.ExitStack() as processes:
 
         def start(module: str, *options: str) -> int:
-            command = [sys.executable, "-m", f"distributed.cli.{module}", *told, *options]
+            command = [sys.executable, "-m", f"distributed.cli.{module}", *reported, *options]
             process = subprocess.Popen(command, env=environment, cwd="/", stderr=subprocess.DEVNULL)
             processes.callback(process.wait, 20)
             processes.callback(process.terminate)

@@ -54,8 +54,8 @@ def write_kind(kind: str, folder: Path, rng: np.random.Generator) -> Path:
     path = folder / f"{kind}.vtkhdf"
     if kind == "volume":
         array = rng.random(GRID.shape_zyx).astype(np.float32)
-        told = {"residual": np.array([1.0, 0.1]), "excluded_pixels": 3}
-        write_volume(path, array, GRID, REFERENCE, provenance=MADE, attributes=told, overwrite=False)
+        reported = {"residual": np.array([1.0, 0.1]), "excluded_pixels": 3}
+        write_volume(path, array, GRID, REFERENCE, provenance=MADE, attributes=reported, overwrite=False)
     elif kind == "vectors":
         write_field(path, rng)
     else:

@@ -176,8 +176,8 @@ def test_tracks_end_before_a_frame_that_is_lost(rig: Path, tmp_path: Path, capsy
     capsys.readouterr()
     with pytest.raises(PartialError, match="2 of 6 frames failed"):
         follow(rig, output, *options, frames=sorted(names))
-    told = capsys.readouterr().err
-    assert all(code in told for code in ("frames-reordered", "frames-missing", "frame-failed"))
+    reported = capsys.readouterr().err
+    assert all(code in reported for code in ("frames-reordered", "frames-missing", "frame-failed"))
     assert [each["name"] for each in json.loads(failures.read_text())] == ["t_7", "t_11"]
     assert sorted(path.stem for path in (output / "particles").iterdir()) == ["t_10", "t_13", "t_8", "t_9"]
     tracks = tracks_of(output)
@@ -209,16 +209,16 @@ def test_it_stops_before_its_time_limit_and_goes_on(
 
     options = ("--threads", 1, *ways)
     follow(rig, output, *options, "--dry-run", "--json")
-    told = json.loads(capsys.readouterr().out)
-    assert (told["frames"], told["to_make"], output.exists()) == (FRAMES, FRAMES, False)
+    reported = json.loads(capsys.readouterr().out)
+    assert (reported["frames"], reported["to_make"], output.exists()) == (FRAMES, FRAMES, False)
     with monkeypatch.context() as patch:
         patch.setattr(Deadline, "leaves_time", leaves_time)
         with pytest.raises(StoppedEarlyError, match=f"3 of {FRAMES} frames are done"):
             follow(rig, output, *options, "--time-limit", "1h")
     assert not (output / "tracks.vtkhdf").exists()
     follow(rig, output, *options, "--dry-run", "--resume", "--json")
-    told = json.loads(capsys.readouterr().out)
-    assert told["to_make"] == (FRAMES if ways else 1)
+    reported = json.loads(capsys.readouterr().out)
+    assert reported["to_make"] == (FRAMES if ways else 1)
     follow(rig, output, "--threads", 2, *ways, "--time-limit", "1h", "--resume")
     if ways:
         return

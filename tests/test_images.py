@@ -21,7 +21,7 @@ from lfpiv_cli.reconstruction import images
 from lfpiv_cli.reconstruction.haze import Haze, White
 from lfpiv_cli.reconstruction.images import as_if_lit, defects, filled, light, noise_residual, saturated, touched
 from lfpiv_cli.synthetic.render import Readout, render_white
-from tests.commands import AT_FOCUS, SAMPLE, run, sample_rig, told
+from tests.commands import AT_FOCUS, SAMPLE, run, sample_rig, summary_of
 from tests.particle_images import light_on
 
 
@@ -210,7 +210,7 @@ def test_reconstruct_takes_haze_off_and_says_so(tmp_path: Path, capsys: pytest.C
     for frame, expected in ((SAMPLE / "pair_a.tif", []), (tmp_path / "hazy.tif", ["haze"])):
         output = tmp_path / f"{frame.stem}.vtkhdf"
         few = ("--solver", "sart", "--iterations", "2", "-o", output)
-        summary = told(capsys, "reconstruct", made, frame, *dark, *few)
+        summary = summary_of(capsys, "reconstruct", made, frame, *dark, *few)
         assert [each["code"] for each in summary["warnings"] if each["code"] == "haze"] == expected
         volumes[frame.stem] = open_volume(output)
     clear, cleared = (volumes[name].array for name in ("pair_a", "hazy"))

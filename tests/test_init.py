@@ -72,9 +72,9 @@ def test_windows_give_ten_vectors_along_each_axis_where_tracers_allow_it(
     few = [axis for axis in range(3) if vectors[axis] < 10]
     shallow = few == [2] and window[2] <= 1.001 * bench.scale.depth_mm
     assert not few or shallow or tracers <= planning.TRACERS_AIMED_AT
-    told, line = capsys.readouterr().err, windows_line(bench)
+    reported, line = capsys.readouterr().err, windows_line(bench)
     assert line.verdict == ("look" if few else "good")
-    assert ("tracers allow fewer than 10 along" in told) == bool(few)
+    assert ("tracers allow fewer than 10 along" in reported) == bool(few)
     assert "set correlation.window_mm" not in line.reason
 
 
@@ -125,17 +125,21 @@ def test_lengths_are_understood_with_their_units_and_a_turned_sign_is_said(spell
     path, words = tmp_path / "rig.yaml", SPELLED[spelled]
     done = typed("\n".join(words.split("|") if "|" in words else words.split()) + "\n", str(path))
     assert done.exit_code == 0, done.output
-    told = yaml.safe_load(path.read_text())
-    assert told["camera"]["main_lens"] == {"magnification": -0.7, "focal_length_mm": 105.0, "f_number": 105.0 / 18.75}
-    assert told["camera"]["microlenses"] == {"focal_length_mm": 1.0, "pitch_mm": 0.125}
-    assert told["camera"]["sensor"]["pixel_um"] == 5.5
-    assert told["channel"] == {"width_mm": 12.0, "wall_mm": 5.0}
-    assert told["volume"]["size_mm"] == [10.0, 10.0, 12.0]
-    assert told["simulation"]["flow"]["velocity_m_s"] == [0.2, 0.0, 0.0]
+    reported = yaml.safe_load(path.read_text())
+    assert reported["camera"]["main_lens"] == {
+        "magnification": -0.7,
+        "focal_length_mm": 105.0,
+        "f_number": 105.0 / 18.75,
+    }
+    assert reported["camera"]["microlenses"] == {"focal_length_mm": 1.0, "pitch_mm": 0.125}
+    assert reported["camera"]["sensor"]["pixel_um"] == 5.5
+    assert reported["channel"] == {"width_mm": 12.0, "wall_mm": 5.0}
+    assert reported["volume"]["size_mm"] == [10.0, 10.0, 12.0]
+    assert reported["simulation"]["flow"]["velocity_m_s"] == [0.2, 0.0, 0.0]
     # Five voxels, a third of a microlens wide each, at 0.2 m/s.
-    assert told["correlation"]["dt_s"] == pytest.approx(5 * 0.125 / 0.7 / 3 / 200, rel=5e-3)
+    assert reported["correlation"]["dt_s"] == pytest.approx(5 * 0.125 / 0.7 / 3 / 200, rel=5e-3)
     # Simulated and fitted by the same light.
-    assert told["reconstruction"]["wavelength_nm"] == told["simulation"]["light"]["wavelength_nm"] == 633.0
+    assert reported["reconstruction"]["wavelength_nm"] == reported["simulation"]["light"]["wavelength_nm"] == 633.0
     assert ("magnification: taken as -0.7, because the image is inverted" in done.stderr) == (words[0] != "-")
 
 

@@ -104,9 +104,9 @@ def write_kind(path: Path, kind: str) -> None:
         write_vectors(path, field, FOCAL_POINT, provenance=PROVENANCE, overwrite=False)
     elif kind == "volume":
         grid = Grid.centred((4, 3, 2), (0.1, 0.1, 0.1), (0.0, 0.0, 0.0))
-        told = {"residual": np.ones(3), "excluded_pixels": 0, "support_voxels": 24}
+        reported = {"residual": np.ones(3), "excluded_pixels": 0, "support_voxels": 24}
         array = rng.random(grid.shape_zyx)
-        write_volume(path, array, grid, FOCAL_POINT, provenance=PROVENANCE, attributes=told, overwrite=False)
+        write_volume(path, array, grid, FOCAL_POINT, provenance=PROVENANCE, attributes=reported, overwrite=False)
     elif kind == "weights":
         config = yaml.safe_load(CONFIG.read_text())
         config["volume"] |= {"shape_xyz": [3, 2, 2], "reference": "focal_point"}
@@ -115,8 +115,8 @@ def write_kind(path: Path, kind: str) -> None:
         assert ended("build-weights", rig, "-o", path) == (0, "")
     else:
         names = {"particles": PARTICLES_FORMAT, "tracks": TRACKS_FORMAT, "trajectories": TRAJECTORIES_FORMAT}
-        told = {"dt_s": 0.1, "residual": 0.1, "refraction": "exact", "excluded_pixels": 0, "read_noise_counts": 1.0}
-        made = points_of(names[kind], rng, provenance=PROVENANCE, particle_diameter_mm=0.1, **told)
+        reported = {"dt_s": 0.1, "residual": 0.1, "refraction": "exact", "excluded_pixels": 0, "read_noise_counts": 1.0}
+        made = points_of(names[kind], rng, provenance=PROVENANCE, particle_diameter_mm=0.1, **reported)
         particle_file.write_points(path, names[kind], made, overwrite=False)
 
 

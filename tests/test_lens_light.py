@@ -129,8 +129,8 @@ def test_little_light_and_rounding_tell_nothing(images: LensImages, lattice: Lat
 @pytest.mark.thorough
 def test_offset_between_lens_images_is_told(images: LensImages, lattice: Lattice) -> None:
     picture = tracers(lattice, share=0.1)
-    for offset, told in ((0.0, []), (2.0 * NOISE, []), (60.0, ["dark-level"]), (-60.0, ["dark-level"])):
-        assert [notice.code for notice in level_notices(images, picture + offset, "a")] == told
+    for offset, reported in ((0.0, []), (2.0 * NOISE, []), (60.0, ["dark-level"]), (-60.0, ["dark-level"])):
+        assert [notice.code for notice in level_notices(images, picture + offset, "a")] == reported
 
 
 @pytest.mark.thorough
@@ -141,8 +141,8 @@ def test_uniform_light_is_no_frame(images: LensImages, lattice: Lattice, table2:
     whole = np.all((centres > RADIUS_PX) & (centres < np.array(SHAPE[::-1]) - RADIUS_PX), axis=1)
     fit = replace(sheet_fit(camera), indices=indices[whole], centres_px=centres[whole])
     noise = tracers(lattice, share=0.0)
-    told = [notice.code for notice in uniform_notices(images, fit, 1000.0 * uniform(lattice) + noise, "a")]
-    assert told == ["frame-uniform"]
+    reported = [notice.code for notice in uniform_notices(images, fit, 1000.0 * uniform(lattice) + noise, "a")]
+    assert reported == ["frame-uniform"]
     for share in (0.1, 0.9):
         assert not list(uniform_notices(images, fit, tracers(lattice, share=share), "a"))
     # A tracer in haze.
@@ -178,9 +178,9 @@ def test_a_picture_that_was_given_before_is_known() -> None:
 
 def test_blur_of_a_white_image_is_told(images: LensImages, lattice: Lattice, table2: Camera) -> None:
     camera = replace(table2, columns=SHAPE[1], rows=SHAPE[0]).with_micro_images(lattice)
-    for blur_px, told in ((0.0, 0), (0.4, 0), (1.2, 1), (2.0, 1)):
+    for blur_px, reported in ((0.0, 0), (0.4, 0), (1.2, 1), (2.0, 1)):
         notices = list(blur_notices(images, gaussian_filter(uniform(lattice), blur_px), camera))
-        assert [notice.code for notice in notices] == told * ["white-blurred"]
+        assert [notice.code for notice in notices] == reported * ["white-blurred"]
         if notices:
             # Less what diffraction and charge are allowed, which these discs have not.
             assert blur_px - 0.4 < float(notices[0].measured) < blur_px + 0.1

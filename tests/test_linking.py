@@ -358,7 +358,7 @@ def test_what_one_frame_lost_is_still_ahead(vortex: Recorded) -> None:
 @pytest.mark.thorough
 def test_a_frame_is_expected_by_what_is_before_and_after_it(vortex: Recorded) -> None:
     found = long_ones(vortex.steps[-1].found, 3)
-    lost, told, ratios, ends = 0, 0, [], 0
+    lost, reported, ratios, ends = 0, 0, [], 0
     for number in range(FRAMES):
         near = {k: vortex.frames[k] for k in range(FRAMES) if abs(k - number) <= REACH_FRAMES}
         ahead = expected_in(found, near, number)
@@ -369,14 +369,14 @@ def test_a_frame_is_expected_by_what_is_before_and_after_it(vortex: Recorded) ->
         # Those that the frame has lost, of which others of the track's places are seen.
         tracked = np.concatenate([vortex.numbers[k][found.labels[k] != NO_TRACK] for k in near if k != number])
         gone = np.setdiff1d(np.flatnonzero(inside & np.isin(np.arange(len(true)), tracked)), vortex.numbers[number])
-        lost, told = lost + len(gone), told + np.isin(gone, who[distance < 0.1]).sum()
+        lost, reported = lost + len(gone), reported + np.isin(gone, who[distance < 0.1]).sum()
         ends += np.isin(gone, who[distance < 0.1]).sum() if number in (0, FRAMES - 1) else 0
         # Light is that of the particle in other frames, here the same in all.
         assert np.all(ahead.light > 0.0)
         assert ahead.light_sigma == pytest.approx(0.0, abs=1e-12)
     assert lost > 100
     assert ends > 20  # Beyond the ends of tracks, too.
-    assert told > 0.85 * lost
+    assert reported > 0.85 * lost
     covered = np.mean(np.abs(np.concatenate(ratios)) < 1.96, axis=0)
     assert np.all((covered > 0.9) & (covered < 0.99))
 

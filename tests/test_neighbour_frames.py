@@ -128,14 +128,14 @@ def test_the_second_frame_goes_on_from_the_first(table2: Camera, water: Media, r
     true, new = strewn(rng), strewn(rng, 2)
     both = np.concatenate([true, new])
     before, task = (task_with(table2, water, each, rng) for each in (true - MOVED, both))
-    told: list[int] = []
-    particles = second_frame(task, before, np.concatenate([true - MOVED, strewn(rng, 3)]), told.append)
+    reported: list[int] = []
+    particles = second_frame(task, before, np.concatenate([true - MOVED, strewn(rng, 3)]), reported.append)
     assert found(particles, both).all()
     assert len(particles) == 32
-    assert sum(told) == STEPS
+    assert sum(reported) == STEPS
     alone = first_pass(task).particles
     assert particles.shape != alone.shape or not np.array_equal(particles, alone)
     # Particles of another scene predict nothing: all is as without a first frame.
-    told.clear()
-    np.testing.assert_array_equal(second_frame(task, before, strewn(rng), told.append), alone)
-    assert sum(told) == STEPS
+    reported.clear()
+    np.testing.assert_array_equal(second_frame(task, before, strewn(rng), reported.append), alone)
+    assert sum(reported) == STEPS

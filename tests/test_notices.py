@@ -38,7 +38,7 @@ from lfpiv_cli.verbs.build_weights import plan_of
 from lfpiv_cli.verbs.checks import doubt_notices, few_notices, still_notices
 from lfpiv_cli.verbs.tracers import light_notices
 from lfpiv_cli.verbs.weights_cost import cost_notices, cost_of
-from tests.commands import AT_FOCUS, CONFIG, ROOT, SAMPLE, run, sample_rig, told
+from tests.commands import AT_FOCUS, CONFIG, ROOT, SAMPLE, run, sample_rig, summary_of
 
 SHAPE = (200, 240)
 PITCH_PX = 14.2
@@ -95,19 +95,19 @@ def test_a_warning_is_printed_in_json_and_in_the_file(tmp_path: Path, capsys: py
     rig, white_tif = tmp_path / "rig.yaml", tmp_path / "white.tif"
     command = ["calibrate-snapshot", rig, "--white", white_tif, "-o", output, "--overwrite"]
 
-    def told(*options: str) -> Any:
+    def reported(*options: str) -> Any:
         run(*command, *options)
         return capsys.readouterr()
 
-    printed = told("--json")
+    printed = reported("--json")
     (warning,) = json.loads(printed.out)["warnings"]
     assert set(warning) == {"code", "about", "text", "remedy", "measured", "expected"}
     assert warning["code"] == "white-stopped-down"
     assert warning["measured"] == pytest.approx(5.0 / PITCH_PX, rel=0.1)
     line = f"lfpiv: warning: {warning['about']}: {warning['text']}; {warning['remedy']} [white-stopped-down]\n"
     assert printed.err == line
-    assert line in told().err
-    assert told("-q").err == ""
+    assert line in reported().err
+    assert reported("-q").err == ""
     record = earlier_record(output)
     assert record is not None
     assert record["warnings"] == [warning]
@@ -194,9 +194,9 @@ def test_image_distance_is_that_of_the_exit_pupil(table2: Camera) -> None:
         camera = thin_lens(table2, entrance_over_exit)
         assert image_distance_notices(fit_of(camera, 1.0), camera) == []
         (notice,) = image_distance_notices(fit_of(camera, 1.002), camera)
-        told = 100.0 * (1.0 / entrance_over_exit + 1.0) if entrance_over_exit else np.inf
-        assert notice.expected == ("an infinite one" if entrance_over_exit == 0.0 else f"{told:.4g} mm")
-        excess = 1.002 * (1.0 + 0.8 / told) - 1.0
+        reported = 100.0 * (1.0 / entrance_over_exit + 1.0) if entrance_over_exit else np.inf
+        assert notice.expected == ("an infinite one" if entrance_over_exit == 0.0 else f"{reported:.4g} mm")
+        excess = 1.002 * (1.0 + 0.8 / reported) - 1.0
         assert notice.measured == pytest.approx(0.8 / excess)
         assert f"(pupil_ratio {0.8 / excess / 100.0 - 1.0:.3g} if all else is right)" in notice.remedy
 
@@ -220,7 +220,7 @@ def test_faults_of_a_rig_that_are_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "told"),
+    ("old", "new", "reported"),
     [
         ("", "", []),
         ("layout: square", "layout: hexagonal", []),
@@ -237,10 +237,10 @@ def test_faults_of_a_rig_that_are_refused(tmp_path: Path) -> None:
         ("[30, 22, 40], voxel_mm: 0.1", "[1500, 1100, 400], voxel_mm: 0.002", ["heavy-work"]),
     ],
 )
-def test_faults_of_a_rig_are_told(old: str, new: str, told: list[str], tmp_path: Path) -> None:
+def test_faults_of_a_rig_are_told(old: str, new: str, reported: list[str], tmp_path: Path) -> None:
     plan = plan_of(rig_of(tmp_path, (old, new)), None)
     cost = cost_of(plan.settings, plan.camera, plan.source, plan.grid.padded(plan.padding))
-    assert [each.code for each in (*plan.notices, *cost_notices(cost))] == told
+    assert [each.code for each in (*plan.notices, *cost_notices(cost))] == reported
 
 
 OBJECTIVE = """
@@ -253,13 +253,13 @@ volume:  {shape_xyz: [10, 10, 10], voxel_mm: [0.005, 0.005, 0.01]}
 """
 
 
-@pytest.mark.parametrize(("na", "told"), [(0.1, []), (0.4, ["paraxial-lens"]), (0.8, None)])
-def test_microscope_objectives(na: float, told: list[str] | None, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("na", "reported"), [(0.1, []), (0.4, ["paraxial-lens"]), (0.8, None)])
+def test_microscope_objectives(na: float, reported: list[str] | None, tmp_path: Path) -> None:
     aperture = 2.0 * 10.5 * np.tan(np.arcsin(na))
     rig = OBJECTIVE.replace("APERTURE", f"{aperture:.4f}").replace("F_NUMBER", f"{210.0 / aperture:.4f}")
     (tmp_path / "rig.yaml").write_text(rig)
-    with pytest.raises(ConfigError, match=r"NA 0\.80.* at most 1 may be") if told is None else nullcontext():
-        assert [each.code for each in plan_of(load_rig(tmp_path / "rig.yaml"), None).notices] == told
+    with pytest.raises(ConfigError, match=r"NA 0\.80.* at most 1 may be") if reported is None else nullcontext():
+        assert [each.code for each in plan_of(load_rig(tmp_path / "rig.yaml"), None).notices] == reported
 
 
 def test_refraction_and_sine_errors_are_those_of_two_rays(table2: Camera, water: Media, window: Window) -> None:
@@ -276,10 +276,10 @@ def test_refraction_and_sine_errors_are_those_of_two_rays(table2: Camera, water:
 
 def test_work_is_estimated_before_it_begins(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     command = ("build-weights", sample_rig(tmp_path, AT_FOCUS), "-o", tmp_path / "w.h5")
-    estimated = told(capsys, *command, "--dry-run")
+    estimated = summary_of(capsys, *command, "--dry-run")
     assert not (tmp_path / "w.h5").exists()
     assert estimated["warnings"] == []
-    made = told(capsys, *command)
+    made = summary_of(capsys, *command)
     weights = open_weights(tmp_path / "w.h5").weights.solver_operator
     held = sum(each.cell.nbytes + each.share.nbytes for each in (weights.columns, weights.rows))
     assert estimated["estimated_weights_bytes"] == pytest.approx(held + 4 * 600 * 448, rel=0.5)
@@ -297,7 +297,7 @@ def test_columns_on_demand_cost_more_than_factors(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("tracks", "wrong", "more", "told"),
+    ("tracks", "wrong", "more", "reported"),
     [
         (100, 4.9, {}, []),
         (100, 5.1, {}, ["wrong-links"]),
@@ -312,9 +312,11 @@ def test_columns_on_demand_cost_more_than_factors(tmp_path: Path) -> None:
         (100, 0.0, {"light_b_over_a": 1.26}, ["light-unequal"]),
     ],
 )
-def test_doubtful_links_and_bends_are_told(tracks: int, wrong: float, more: dict[str, Any], told: list[str]) -> None:
+def test_doubtful_links_and_bends_are_told(
+    tracks: int, wrong: float, more: dict[str, Any], reported: list[str]
+) -> None:
     summary = {"tracks": tracks, "expected_wrong_links": wrong} | more
-    assert [notice.code for notice in doubt_notices(summary, "a")] == told
+    assert [notice.code for notice in doubt_notices(summary, "a")] == reported
 
 
 def test_one_image_twice_and_few_links_are_told() -> None:
@@ -348,15 +350,15 @@ def told_of_board(camera: Camera, board: BoardGeometry, found: int, z_mm: float,
 
 def test_boards_with_doubts_are_told(table2: Camera) -> None:
     assert told_of_board(table2, BoardGeometry((3, 3), 0.6, 0.2), 9, 5.0, -1.0) == []
-    (told,) = told_of_board(table2, BoardGeometry((3, 2), 0.6, 0.2), 6, 5.0, -1.0)
-    assert (told.code, told.measured) == ("board-few-points", 6.0)
+    (reported,) = told_of_board(table2, BoardGeometry((3, 2), 0.6, 0.2), 6, 5.0, -1.0)
+    assert (reported.code, reported.measured) == ("board-few-points", 6.0)
     scale = table2.scale(Media())
     board, larger = (BoardGeometry((5, 4), 0.6, size * scale.lens_mm) for size in (0.7, 1.1))
-    (told,) = told_of_board(table2, board, 20, -0.1 * scale.depth_mm, -1.0)
-    assert told.code == "board-within-lenses"
-    assert told.measured == pytest.approx(0.8)
+    (reported,) = told_of_board(table2, board, 20, -0.1 * scale.depth_mm, -1.0)
+    assert reported.code == "board-within-lenses"
+    assert reported.measured == pytest.approx(0.8)
     # To where light spreads over two lenses.
-    assert "by 1 mm" in told.remedy
+    assert "by 1 mm" in reported.remedy
     assert told_of_board(table2, board, 20, -0.4 * scale.depth_mm, -1.0) == []
     assert told_of_board(table2, larger, 20, 0.0, -1.0) == []
     board = BoardGeometry((5, 4), 0.6, 0.2)

@@ -133,8 +133,8 @@ def test_white_light_backwards_equals_forwards(
 def test_a_white_image_tells_of_the_objective(
     small: Camera, rng: np.random.Generator, strengths: dict[str, float | tuple[float, float]], code: str | None
 ) -> None:
-    told = shape_notices(shapes_in(white_of(with_objective(small, **strengths), rng)))
-    assert [each.code for each in told] == ([] if code is None else [code])
+    reported = shape_notices(shapes_in(white_of(with_objective(small, **strengths), rng)))
+    assert [each.code for each in reported] == ([] if code is None else [code])
 
 
 def test_cut_and_growth_are_those_of_the_corners(small: Camera, rng: np.random.Generator) -> None:
@@ -169,8 +169,8 @@ def test_a_board_tells_of_a_curved_field(small: Camera, rng: np.random.Generator
     found = field_depth(curved, small)
     assert found is not None
     assert found.value == pytest.approx(0.1, abs=5.0 * found.sigma)
-    told = [[each.code for each in board_notices(pose, board, small, Media())] for pose in (curved, flat)]
-    assert ["field-curved" in codes for codes in told] == [True, False]
+    reported = [[each.code for each in board_notices(pose, board, small, Media())] for pose in (curved, flat)]
+    assert ["field-curved" in codes for codes in reported] == [True, False]
 
 
 @pytest.mark.parametrize(("strengths", "refused"), [({"falloff": 0.3}, False), ({"astigmatism_mm": 0.1}, True)])
@@ -271,11 +271,11 @@ def test_points_in_air_light_the_pixels_that_two_lenses_and_a_stop_make_them_lig
     camera, air = lenses.camera(), Media()
     points = rng.uniform((-6.0, -5.0, -20.0), (6.0, 5.0, 20.0), (400, 3))
     stop = rng.uniform(-8.0, 8.0, (400, 2))
-    told, array = lenses.pixels(stop, lenses.to_stop(points[:, :2], points[:, 2:], stop), camera.lattice)
+    reported, array = lenses.pixels(stop, lenses.to_stop(points[:, :2], points[:, 2:], stop), camera.lattice)
     entrance = stop * lenses.entrance_per_stop
     hits = trace(camera, entrance, slopes_equivalent(points, entrance, camera, air))
     np.testing.assert_allclose(hits.array_mm, array, rtol=0, atol=1e-11)
-    np.testing.assert_allclose(hits.sensor_mm / camera.pixel_mm, told, rtol=0, atol=1e-8)
+    np.testing.assert_allclose(hits.sensor_mm / camera.pixel_mm, reported, rtol=0, atol=1e-8)
 
 
 def test_points_in_water_are_seen_by_snell_from_the_entrance_pupil(lenses, rng):
@@ -295,10 +295,10 @@ def test_points_in_water_are_seen_by_snell_from_the_entrance_pupil(lenses, rng):
     entrance = np.stack([stop * lenses.entrance_per_stop, np.zeros(100)], axis=1)
     hits = trace(camera, entrance, slopes_exact(points, entrance, camera, WATER, window))
     flat = np.zeros((100, 1))
-    told, _ = lenses.pixels(
+    reported, _ = lenses.pixels(
         np.hstack([stop[:, np.newaxis], flat]), np.hstack([slope[:, np.newaxis], flat]), camera.lattice
     )
-    np.testing.assert_allclose(hits.sensor_mm / camera.pixel_mm, told, rtol=0, atol=1e-8)
+    np.testing.assert_allclose(hits.sensor_mm / camera.pixel_mm, reported, rtol=0, atol=1e-8)
 
 
 def test_lens_images_are_projected_from_the_exit_pupil(lenses):
@@ -310,10 +310,10 @@ def test_lens_images_are_projected_from_the_exit_pupil(lenses):
 
 
 def test_thin_lenses_stand_for_themselves_and_the_two_are_what_they_are_called(camera):
-    told = replace(camera, magnification=-0.7, focal_length_mm=98.7)
-    for same in (thin_lens(told, 1.0), real_lens(told), refocused(told, -0.7)):
+    reported = replace(camera, magnification=-0.7, focal_length_mm=98.7)
+    for same in (thin_lens(reported, 1.0), real_lens(reported), refocused(reported, -0.7)):
         assert (same.focal_length_mm, same.microlens_distance_mm, same.pixel_mm) == (98.7, 0.8, 0.0055)
-    assert refocused(told, -0.9).image_distance_mm == replace(told, magnification=-0.9).image_distance_mm
+    assert refocused(reported, -0.9).image_distance_mm == replace(reported, magnification=-0.9).image_distance_mm
     ratios = [each.entrance_over_exit for each in LENSES.values()]
     assert ratios == pytest.approx([1.0 / 0.8, 1.0 / 1.3, 0.0], abs=1e-12)
 
@@ -321,9 +321,9 @@ def test_thin_lenses_stand_for_themselves_and_the_two_are_what_they_are_called(c
 @pytest.mark.parametrize("entrance_over_exit", [1.25, 0.6, 0.0])
 def test_refocused_is_the_same_lens_at_another_magnification(camera, entrance_over_exit):
     seen = refocused(thin_lens(camera, entrance_over_exit), -0.8)
-    told = thin_lens(replace(camera, magnification=-0.8), entrance_over_exit)
+    reported = thin_lens(replace(camera, magnification=-0.8), entrance_over_exit)
     for name in ("magnification", "focal_length_mm", "microlens_distance_mm", "pixel_mm", "entrance_over_exit"):
-        assert getattr(seen, name) == pytest.approx(getattr(told, name), rel=1e-14)
+        assert getattr(seen, name) == pytest.approx(getattr(reported, name), rel=1e-14)
 
 
 def test_weights_files_know_the_lens(tmp_path):
@@ -365,7 +365,7 @@ def data_sheet(lenses, folder):
     q = lenses.entrance_over_exit
     ratio = {"pupil_ratio": 1.0 / q} if q > 1e-9 else {"image_distance": "infinite"}
     size = [round(0.75 * side * PIXEL / abs(lenses.image()[1]), 2) for side in (COLUMNS, ROWS)]
-    told = {
+    reported = {
         "camera": {
             "main_lens": {
                 "magnification": lenses.image()[1],
@@ -382,7 +382,7 @@ def data_sheet(lenses, folder):
         "reconstruction": {"particle_diameter_mm": TRACER_MM},
     }
     path = folder / "rig.yaml"
-    path.write_text(yaml.safe_dump(told))
+    path.write_text(yaml.safe_dump(reported))
     return lf.load_rig(path)
 
 

@@ -293,8 +293,8 @@ def test_every_frame_is_in_one_share_and_shares_differ_by_one_frame(total: int, 
 
 
 def slurm(task: int, first: int, count: int, step: int | None = 1) -> dict[str, str]:
-    told = {"ID": task, "MIN": first, "COUNT": count} | ({} if step is None else {"STEP": step})
-    return {f"SLURM_ARRAY_TASK_{name}": str(value) for name, value in told.items()}
+    reported = {"ID": task, "MIN": first, "COUNT": count} | ({} if step is None else {"STEP": step})
+    return {f"SLURM_ARRAY_TASK_{name}": str(value) for name, value in reported.items()}
 
 
 def test_shares_as_people_write_them_and_slurm_tells_them() -> None:
@@ -303,18 +303,18 @@ def test_shares_as_people_write_them_and_slurm_tells_them() -> None:
     for text in ("0/3", "4/3", "1/0", "3", "1/3/5", "a/b", "-1/3", "1.0/3", "", "1/99999999", "²/3"):
         with pytest.raises(UsageError, match="--shard"):
             Shard.parse(text)
-    for told, share in (
+    for reported, share in (
         (slurm(0, 0, 4), Shard(1, 4)),
         (slurm(20, 1, 20, None), Shard(20, 20)),
         (slurm(14, 10, 5, 2), Shard(3, 5)),
         # one job of an array that is started again alone does what is left
         (slurm(7, 7, 1), Shard(1, 1)),
     ):
-        assert Shard.parse("slurm", told) == share
+        assert Shard.parse("slurm", reported) == share
     no_range = {**slurm(1, 1, 2), "SLURM_ARRAY_TASK_ID": "x"}
-    for told in ({}, slurm(7, 1, 3), slurm(4, 1, 5, 2), no_range):
+    for reported in ({}, slurm(7, 1, 3), slurm(4, 1, 5, 2), no_range):
         with pytest.raises(UsageError, match="--shard slurm"):
-            Shard.parse("slurm", told)
+            Shard.parse("slurm", reported)
 
 
 TIMES = {"3600": 3600.0, "50m": 3000.0, "1.5h": 5400.0, "90s": 90.0, "2d": 172800.0, "00:50:00": 3000.0}
@@ -341,10 +341,10 @@ def test_a_frame_that_would_not_be_done_is_not_begun(monkeypatch: pytest.MonkeyP
     assert not deadline.leaves_time(2)
     clock[0] = 61.0
     assert not deadline.leaves_time()
-    told = deadline.error(2, 5, "frame")
-    assert "39 s are left" in str(told)
-    assert "2 of 5 frames are done; the same command with --resume goes on" in str(told)
-    assert told.exit_code == 75
+    reported = deadline.error(2, 5, "frame")
+    assert "39 s are left" in str(reported)
+    assert "2 of 5 frames are done; the same command with --resume goes on" in str(reported)
+    assert reported.exit_code == 75
     assert Deadline(None, longest_s=1e9, begun=-1e9).leaves_time()
 
 
@@ -470,7 +470,7 @@ def test_nothing_more_is_begun_after_an_error() -> None:
 def test_a_file_that_stays_broken_is_passed_over_and_taken_when_it_is_whole(recorder: Recorder) -> None:
     recorder.plan = [(0.0, "1", WHOLE[:5]), (0.0, "2", WHOLE), (PASSED_OVER_S + 8.0, "1", WHOLE[5:])]
     recorder.write()
-    told: list[str] = []
-    groups = as_they_come(recorder.listed, read, 15.0, lambda path, error: told.append(f"{path.name}, {error}"))
+    reported: list[str] = []
+    groups = as_they_come(recorder.listed, read, 15.0, lambda path, error: reported.append(f"{path.name}, {error}"))
     assert [[path.name for path in group] for group in groups] == [["2"], ["1"]]
-    assert told == [f"1, {recorder.folder / '1'}: is cut"]
+    assert reported == [f"1, {recorder.folder / '1'}: is cut"]

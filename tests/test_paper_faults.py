@@ -144,8 +144,8 @@ def test_velocities_of_the_wrong_sign_miss_limits(signs: tuple[float, float, flo
     moved = np.stack([0.1 + 0.02 * z, 0.0 * z, 0.0 * z + 0.05], axis=-1) * signs * 1000.0 * 0.001 / 0.1
     write_vectors(vectors, field_on(grid, moved), FOCAL_POINT, provenance={}, overwrite=False)
     ended = CliRunner().invoke(cli, ["validate", "flow", str(config), "--vectors", str(vectors), "-o", str(tmp_path)])
-    told = ended.exception.exit_code if isinstance(ended.exception, LimitMissedError) else ended.exit_code
-    assert told == exit_code, ended.output
+    reported = ended.exception.exit_code if isinstance(ended.exception, LimitMissedError) else ended.exit_code
+    assert reported == exit_code, ended.output
 
 
 DEPTHS = np.array([-3.0, 0.0, 4.0])
@@ -300,11 +300,11 @@ def test_what_harms_most_comes_first():
     assert "calliper" not in care([by_theory(known), *found[:1], *found[2:]])
 
 
-@pytest.mark.parametrize(("recall", "told"), [((0.97, 0.95, 0.6), "from 1.2 on"), ((1.0, 1.0, 1.0), "at none")])
-def test_from_where_tracers_crowd(recall: tuple[float, ...], told: str):
+@pytest.mark.parametrize(("recall", "reported"), [((0.97, 0.95, 0.6), "from 1.2 on"), ((1.0, 1.0, 1.0), "at none")])
+def test_from_where_tracers_crowd(recall: tuple[float, ...], reported: str):
     found = lines_of(influences.SEEDING, {})
     found.figures["recall"][:] = np.array(recall)[:, np.newaxis]  # type: ignore[index]
-    assert told in crowding(found)
+    assert reported in crowding(found)
 
 
 @pytest.mark.thorough
@@ -376,9 +376,9 @@ def test_both_frames_show_the_same_bubbles_which_need_a_channel_beside_the_same_
     # counts are rounded
     np.testing.assert_allclose(*difference, atol=1.0)
     assert difference[0].max() > 8000.0
-    told = read_json(bubbly / "particles.json")["bubbles_mm"]
-    assert np.shape(told) == (3, 4)
-    assert np.array(told)[:, 1] + 0.5 * np.array(told)[:, 3] == pytest.approx(np.full(3, 0.8))
+    reported = read_json(bubbly / "particles.json")["bubbles_mm"]
+    assert np.shape(reported) == (3, 4)
+    assert np.array(reported)[:, 1] + 0.5 * np.array(reported)[:, 3] == pytest.approx(np.full(3, 0.8))
     assert "bubbles_mm" not in read_json(plain / "particles.json")
     # Bubbles need a channel.
     sections = channel_sections(TINY, simulation={"bubbles": 1})

@@ -122,10 +122,12 @@ def test_a_page_holds_its_pictures_and_loads_nothing_and_is_written_as_markdown_
     assert report["provenance"]["command"] == "validate paper, tiny"
 
 
-@pytest.mark.parametrize(("best", "told"), [(0.3, "0.3"), (None, "unknown")])
-def test_a_missed_or_unknown_row_fails_and_the_report_is_there(parts, tmp_path: Path, best, told: list[str]) -> None:
+@pytest.mark.parametrize(("best", "reported"), [(0.3, "0.3"), (None, "unknown")])
+def test_a_missed_or_unknown_row_fails_and_the_report_is_there(
+    parts, tmp_path: Path, best, reported: list[str]
+) -> None:
     parts["row"] = replace(GOOD, best=best)
-    with pytest.raises(LimitMissedError, match=f"is {told}, expected at most 0.2") as missed:
+    with pytest.raises(LimitMissedError, match=f"is {reported}, expected at most 0.2") as missed:
         validate_paper(tmp_path, TINY, console=QUIET)
     assert missed.value.figures["met"] == 1
     assert (tmp_path / "index.html").exists()
@@ -295,10 +297,10 @@ def test_boards_of_the_full_size_and_where_the_steps_err(tmp_path):
     assert all((scene.photons_per_count, scene.read_noise_counts))
     depth = np.arange(-4.0, 5.0)
     errors = np.where(np.abs(depth[:-1] + 0.5) < 2.0, -0.07, 0.01)
-    told = table3._where_steps(depth, errors)
+    reported = table3._where_steps(depth, errors)
     # four steps of 7 %, four of 1 %
-    assert told.startswith("88 % of it comes from the 4 steps within 2 mm")
-    assert told.endswith("1.00 %")
+    assert reported.startswith("88 % of it comes from the 4 steps within 2 mm")
+    assert reported.endswith("1.00 %")
     by_depth = {"depth_mm": [-2.0, 0.0, 2.0], "spacing_mm": [1.0, 1.01, 1.0], "centre_mm": [-2.2, 0.0, 1.9]}
     figure = location_figure({"ERT": {"by_depth": by_depth}}, 1.0, None)
     curves = {axes.get_title(): axes.get_lines()[-1].get_ydata() for axes in figure.axes}

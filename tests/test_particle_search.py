@@ -414,5 +414,5 @@ def test_crowded_tracers_are_not_taken_for_noise(bench: Bench) -> None:
     # No pixel is as dark as without light, and most lie far from the median.
     crowd = image_of(bench, 12.0, 0)
     noise = np.random.default_rng(0).normal(0.0, 6.0, crowd.shape).astype(np.float32)
-    for image, told in ((crowd, False), (noise, True), (noise + np.float32(100.0), True)):
-        assert ("frame-dark" in {each.code for each in frame_notices(bench, image, image, "a")}) == told
+    for image, reported in ((crowd, False), (noise, True), (noise + np.float32(100.0), True)):
+        assert ("frame-dark" in {each.code for each in frame_notices(bench, image, image, "a")}) == reported

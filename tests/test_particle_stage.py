@@ -20,7 +20,7 @@ from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, TRACKS_FORMAT, TRAJE
 from lfpiv_cli.files.vtkhdf import open_vectors
 from lfpiv_cli.grid import Reference
 from lfpiv_cli.validation.volume import particle_figures
-from tests.commands import CONFIG, SAMPLE, run, told
+from tests.commands import CONFIG, SAMPLE, run, summary_of
 from tests.read_back import vtk_opened
 
 LOW, HIGH = (-1.5, -1.1, -2.0), (1.5, 1.1, 2.0)
@@ -60,7 +60,7 @@ def pair(tmp_path: Path, rng: np.random.Generator) -> list[Path]:
 
 
 def test_track_writes_tracks_and_vectors(pair: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert told(capsys, "track", *pair, "-o", tmp_path / "tracks.vtkhdf", "--grid")["tracks"] > 290
+    assert summary_of(capsys, "track", *pair, "-o", tmp_path / "tracks.vtkhdf", "--grid")["tracks"] > 290
     tracks = read_points(tmp_path / "tracks.vtkhdf", TRACKS_FORMAT)
     # 2 voxels of 0.1 mm in 2 ms.
     np.testing.assert_allclose(np.median(tracks.arrays["velocity"], axis=0), (0.1, -0.05, 0.025), atol=1e-9)
@@ -107,7 +107,7 @@ def test_few_particles_are_tracked_and_said(
     error = capsys.readouterr().err
     assert said in error
     assert ("lfpiv:" in error) == bool(said)
-    summary = told(capsys, *command, "--overwrite")
+    summary = summary_of(capsys, *command, "--overwrite")
     assert summary["tracks"] == tracks
     # Forty tracks of three places show no noise: a parabola takes them all.
     assert summary.get("noise_over_stated") is None
@@ -302,16 +302,16 @@ def test_each_pair_has_a_file_of_its_own(particles: Path, tmp_path: Path, capsys
 def test_what_is_complete_is_skipped(particles: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = tmp_path / "tracks"
     batch = ("track", particles, "--pairing", "ab", "-o", folder)
-    assert told(capsys, *batch)["tracks"] == 120
+    assert summary_of(capsys, *batch)["tracks"] == 120
     with pytest.raises(OutputExistsError):
         run(*batch)
     before = {path.name: path.stat().st_mtime_ns for path in folder.iterdir()}
-    assert told(capsys, *batch, "--resume")["skipped"] == 3
+    assert summary_of(capsys, *batch, "--resume")["skipped"] == 3
     assert {path.name: path.stat().st_mtime_ns for path in folder.iterdir()} == before
     # The vectors are missing: tracks are made again with them.
     run(*batch, "--resume", "--grid")
     (folder / "a1_grid.vtkhdf").unlink()
-    summary = told(capsys, *batch, "--resume", "--grid")
+    summary = summary_of(capsys, *batch, "--resume", "--grid")
     assert (summary["skipped"], summary["tracks"]) == (2, 40)
     assert len(list(folder.iterdir())) == 6
 
@@ -355,7 +355,7 @@ def test_a_sequence_is_in_the_order_of_its_numbers(
         path.rename(tmp_path / f"frame_{number}.vtkhdf") for path, number in zip(paths, (8, 9, 10, 12), strict=True)
     ]
     # As a shell sorts them.
-    summary = told(capsys, "track", *sorted(paths), "-o", tmp_path / "tracks.vtkhdf")
+    summary = summary_of(capsys, "track", *sorted(paths), "-o", tmp_path / "tracks.vtkhdf")
     assert [each["code"] for each in summary["warnings"]] == ["frames-missing", "frames-reordered"]
     tracks = read_points(tmp_path / "tracks.vtkhdf", TRAJECTORIES_FORMAT)
     np.testing.assert_allclose(tracks.arrays["velocity"], np.tile(MOVED_MM / 2.0, (160, 1)), atol=1e-9)

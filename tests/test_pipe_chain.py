@@ -20,7 +20,7 @@ from lfpiv_cli.files.weights_file import open_weights
 from lfpiv_cli.flow.field import MASKED
 from lfpiv_cli.self_calibration import refinement
 from lfpiv_cli.weights.strips import StripOperator
-from tests.commands import AT_FOCUS, CONFIG, ROOT, SAMPLE, changed, run, sample_rig, told
+from tests.commands import AT_FOCUS, CONFIG, ROOT, SAMPLE, changed, run, sample_rig, summary_of
 
 CONFIGS = ROOT / "configs"
 # What stands in the files, and what makes of them a section of the pipe's middle on a part of the sensor.
@@ -96,7 +96,7 @@ def test_a_pipes_wall_may_be_given_by_its_heights(tmp_path: Path) -> None:
 
 
 # Where a pipe is said to be, and where it is: aside, and tilted in the image and away from the camera by 0.25 degrees.
-TOLD, BESIDE = "centre_mm: [0, 0, 0]", "centre_mm: [0, -0.1, 0.15]"
+REPORTED, BESIDE = "centre_mm: [0, 0, 0]", "centre_mm: [0, -0.1, 0.15]"
 TILT_DEG = (-0.25, 0.25)
 ASLANT = "axis: [1, -0.0043634, 0.0043634]"
 
@@ -106,7 +106,7 @@ def test_a_pipe_that_lies_elsewhere_is_found(tmp_path: Path, capsys: pytest.Capt
     """Images of one pipe, the rig file of another: its axis is found, and with it the flow is right."""
     fewer = ("shape_xyz: [100, 100, 100]", "shape_xyz: [22, 100, 100]"), ("particles: 5000", "particles: 1100")
     text = changed("pipe", ("rows: 1768", "rows: 500"), *fewer, ("seed: 7", "seed: 23"))
-    true, faces = re.subn(f"axis: x, (radius_mm: .*), {re.escape(TOLD)}", rf"{ASLANT}, \1, {BESIDE}", text)
+    true, faces = re.subn(f"axis: x, (radius_mm: .*), {re.escape(REPORTED)}", rf"{ASLANT}, \1, {BESIDE}", text)
     true, sections = re.subn(r"axis: x([,}])", rf"{ASLANT}, {BESIDE}\1", true)
     assert (faces, sections) == (2, 3)  # of these the pipe, the flow and what it is judged by
     # Whole: the true pipe reaches beyond the volume that is told.
@@ -119,7 +119,7 @@ def test_a_pipe_that_lies_elsewhere_is_found(tmp_path: Path, capsys: pytest.Capt
     dark = ("--dark", tmp_path / "dark.tif")
     run("calibrate-snapshot", tmp_path / "told.yaml", "--white", tmp_path / "white.tif", *dark, "-o", lattice)
     words = ("--calibration", lattice, *dark, "-o", refined, "--picture", tmp_path / "walls.png")
-    figures = told(capsys, "refine-calibration", tmp_path / "told.yaml", images / "pair_a.tif", *words)
+    figures = summary_of(capsys, "refine-calibration", tmp_path / "told.yaml", images / "pair_a.tif", *words)
     # Measured: within 2 um and 0.01 degrees by the images; by the wall of so little pipe within its error, some 40 um.
     np.testing.assert_allclose(figures["axis_shift_mm"], (-0.1, 0.15), atol=0.01)
     np.testing.assert_allclose(figures["axis_tilt_deg"], TILT_DEG, atol=0.06)
@@ -165,7 +165,7 @@ def test_a_wrong_mid_plane_is_found_and_mended(wrong: Path, tmp_path: Path, caps
     image, dark = SAMPLE / "pair_a.tif", ("--dark", SAMPLE / "dark.tif")
     output, picture = tmp_path / "refined.h5", tmp_path / "walls.png"
     targets = ("-o", output, "--picture", picture)
-    summary = told(capsys, "refine-calibration", CONFIG, image, "--calibration", wrong, *dark, *targets)
+    summary = summary_of(capsys, "refine-calibration", CONFIG, image, "--calibration", wrong, *dark, *targets)
     truth = json.loads((SAMPLE / "particles.json").read_text())["reference_z_mm"]
     assert abs(summary["mid_plane_z_mm"] - truth) < 3 * summary["mid_plane_z_mm_sigma"]
     assert summary["mid_plane_z_mm_sigma"] < 0.03
@@ -195,7 +195,7 @@ def test_half_a_millimetre_on_the_pair(data_folder: Path, tmp_path: Path, capsys
     assert right.mid_plane_z_mm is not None
     moved = replace(right.rectification, fit=right.fit.shifted(np.array([0.2, -0.1])))
     write_calibration(off, replace(right, rectification=moved, mid_plane_z_mm=right.mid_plane_z_mm + 0.5), {}, False)
-    summary = told(capsys, "refine-calibration", config, data / "pair_a.tif", "--calibration", off, *dark)
+    summary = summary_of(capsys, "refine-calibration", config, data / "pair_a.tif", "--calibration", off, *dark)
     truth = json.loads((data / "truth.json").read_text())
     # Measured: 0.002 mm and 0.0004 px are left.
     left = summary["mid_plane_z_mm"] - truth["mid_plane_z_mm"]

@@ -18,7 +18,7 @@ from lfpiv_cli.reconstruction.solvers import Momentum, Problem, SolverSettings, 
 from lfpiv_cli.verbs.checks import word_of
 from lfpiv_cli.verbs.frames import Background
 from lfpiv_cli.weights.build import factorise
-from tests.commands import SAMPLE, run, sample_weights, told
+from tests.commands import SAMPLE, run, sample_weights, summary_of
 
 
 class DenseOperator:
@@ -348,13 +348,15 @@ def test_frames_that_show_nothing_are_refused_or_told(weights, frame, tmp_path, 
         volume_of(weights, tmp_path / "a.tif", tmp_path / "v.vtkhdf", "--mask", tmp_path / "mask.tif")
     assert not (tmp_path / "v.vtkhdf").exists()
     dark = SAMPLE / "dark.tif"
-    summary = told(capsys, "reconstruct", weights, dark, "--iterations", 4, "--dark", dark, "-o", tmp_path / "v.vtkhdf")
+    summary = summary_of(
+        capsys, "reconstruct", weights, dark, "--iterations", 4, "--dark", dark, "-o", tmp_path / "v.vtkhdf"
+    )
     texts = {each["code"]: each["text"] for each in summary["warnings"]}
     assert texts["frame-given-before"] == "the file is also the dark of reconstruct: it shows no tracers"
 
 
 # The weights believe the data sheet, and the sample's lens images lie a few pixels beside it.
-TOLD = {
+REPORTED = {
     "none": ["lens-images-moved"],
     "noise": ["frame-dark", "dark-level"],
     "noise less dark": ["frame-dark"],
@@ -363,7 +365,7 @@ TOLD = {
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize("fault", TOLD)
+@pytest.mark.parametrize("fault", REPORTED)
 def test_a_frame_of_noise_or_half_saturated_is_told(weights, frame, fault, tmp_path, rng, capsys):
     dark = read_image(SAMPLE / "dark.tif")
     if fault.startswith("noise"):
@@ -373,9 +375,9 @@ def test_a_frame_of_noise_or_half_saturated_is_told(weights, frame, fault, tmp_p
     tifffile.imwrite(tmp_path / "a.tif", frame)
     options = () if fault == "noise" else ("--dark", SAMPLE / "dark.tif")
     command = ("reconstruct", weights, tmp_path / "a.tif", "--iterations", 4, *options, "-o", tmp_path / "v.vtkhdf")
-    summary = told(capsys, *command)
+    summary = summary_of(capsys, *command)
     for warnings in (summary["warnings"], open_volume(tmp_path / "v.vtkhdf").provenance.get("warnings", [])):
-        assert [each["code"] for each in warnings] == TOLD[fault]
+        assert [each["code"] for each in warnings] == REPORTED[fault]
 
 
 # Of the sample's pixels three in five are lit.
@@ -387,7 +389,7 @@ def test_saturated_pixels_count_as_much_before_the_work_as_after_it(weights, fra
     recorded = dark + light * 4000.0 / np.percentile(light, 100.0 - percent)
     tifffile.imwrite(tmp_path / "a.tif", np.clip(np.rint(recorded), 0, 4095).astype(np.uint16))
     options = tmp_path / "a.tif", "--dark", SAMPLE / "dark.tif"
-    verdicts = told(capsys, "check", weights.parent / "rig.yaml", *options)["verdicts"]
+    verdicts = summary_of(capsys, "check", weights.parent / "rig.yaml", *options)["verdicts"]
     before = {line["about"]: line["verdict"] for line in verdicts}
     volume_of(weights, options[0], tmp_path / "v.vtkhdf", *options[1:])
     warnings = open_volume(tmp_path / "v.vtkhdf").provenance["warnings"]

@@ -31,7 +31,7 @@ from lfpiv_cli.verbs.plot import figures_of
 from lfpiv_cli.verbs.report import ReportOptions, report
 from tests import vector_fields
 from tests.browser import CHROMIUM, opened
-from tests.commands import ROOT, run, table2_rig, told
+from tests.commands import ROOT, run, summary_of, table2_rig
 from tests.vector_fields import SHAPE, SIGMA_VOXEL, field_of, noise_mm, pair_tracks, points_of, rotation_mm, steady_mm
 
 QUIET = Console(quiet=True)
@@ -309,14 +309,14 @@ def volume(tmp_path):
 
 @pytest.mark.thorough
 def test_pdf_and_png_have_a_figure_for_each_name_and_the_same_bytes_again(volume, tmp_path, capsys):
-    assert told(capsys, "plot", volume, "-o", tmp_path / "v.pdf")["figures"] == ["projections", "depths"]
+    assert summary_of(capsys, "plot", volume, "-o", tmp_path / "v.pdf")["figures"] == ["projections", "depths"]
     content = (tmp_path / "v.pdf").read_bytes()
     assert len(re.findall(rb"/Type /Page\b(?!s)", content)) == 2
     run("plot", volume, "-o", tmp_path / "v.pdf", "--overwrite")
     assert (tmp_path / "v.pdf").read_bytes() == content
     run("plot", volume, "-o", tmp_path / "one.png", "--only", "depths")
     assert cv2.imread(str(tmp_path / "one.png")) is not None
-    found = told(capsys, "plot", volume, "-o", tmp_path / "p.png")
+    found = summary_of(capsys, "plot", volume, "-o", tmp_path / "p.png")
     assert found["files"] == [str(tmp_path / f"p_{name}.png") for name in ("projections", "depths")]
     assert sorted(path.name for path in tmp_path.glob("p*.png")) == ["p_depths.png", "p_projections.png"]
 

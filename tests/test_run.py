@@ -21,7 +21,7 @@ from lfpiv_cli.verbs.report import report
 from lfpiv_cli.verbs.run_steps import RunOptions
 from tests.commands import SAMPLE, sample_rig
 from tests.commands import run as lfpiv
-from tests.commands import told as told_of
+from tests.commands import summary_of as told_of
 
 PAIR = SAMPLE / "pair_a.tif", SAMPLE / "pair_b.tif"
 PHOTOGRAPHS = [word for name in ("white", "dark", "board") for word in (f"--{name}", SAMPLE / f"{name}.tif")]
@@ -77,13 +77,13 @@ def test_files_are_those_of_the_single_commands_and_it_says_what_was_chosen(ran:
     lfpiv("correlate", *(tmp_path / name for name in FILES[3:]), "-o", tmp_path / VECTORS, "-q")
     for name in (*FILES, VECTORS):
         assert (tmp_path / name).read_bytes() == (ran / "out" / name).read_bytes(), name
-    told = told_by(ran)
-    assert (told["method"], told["reason"]) == ("volumes", f"as asked for; but there are {RIGHT}")
+    reported = told_by(ran)
+    assert (reported["method"], reported["reason"]) == ("volumes", f"as asked for; but there are {RIGHT}")
     # 400 tracers before 660 microlenses.
-    assert told["tracers_per_lens"] == pytest.approx(0.61, rel=0.2)
-    assert list(told["summaries"]) == ["calibrate-snapshot", "build-weights", "reconstruct", "correlate"]
-    assert told["figures"]["vectors"] == {"volumes": 90}
-    assert told["figures"]["u_from_voxel"]["volumes"] < told["figures"]["u_to_voxel"]["volumes"]
+    assert reported["tracers_per_lens"] == pytest.approx(0.61, rel=0.2)
+    assert list(reported["summaries"]) == ["calibrate-snapshot", "build-weights", "reconstruct", "correlate"]
+    assert reported["figures"]["vectors"] == {"volumes": 90}
+    assert reported["figures"]["u_from_voxel"]["volumes"] < reported["figures"]["u_to_voxel"]["volumes"]
     (tmp_path / "run.json").write_text("mine")
     with pytest.raises(OutputExistsError, match=r"run.json"):
         run(ran / "rig.yaml", tmp_path)
@@ -95,9 +95,9 @@ def test_what_is_done_is_kept_with_its_summary_and_what_is_lost_is_made_again(ag
     run(again / "rig.yaml", again / "out")
     assert stamps(again) == before
     assert set(states(again).values()) == {"kept"}
-    told = told_by(again)
-    assert told["summaries"] == earlier["summaries"]
-    assert told["warnings"] == earlier["warnings"]
+    reported = told_by(again)
+    assert reported["summaries"] == earlier["summaries"]
+    assert reported["warnings"] == earlier["warnings"]
     (again / "out" / "calibration.png").unlink()
     run(again / "rig.yaml", again / "out")
     assert (again / "out" / "calibration.png").exists()
@@ -118,10 +118,10 @@ def test_a_person_is_told_what_was_made_and_a_program_all(again: Path, capsys: p
     assert made == "made: report.html"
     assert after == f"open next: {again / 'out' / 'report.html'} in a browser, {again / 'out' / VECTORS} in ParaView"
     assert figures.startswith("all figures: --json")
-    told = told_of(capsys, *words)
-    assert told["sentence"] == sentence
-    assert told["steps_kept"] == 5
-    assert told["u_sigma_voxel"]["volumes"] > 0.0
+    reported = told_of(capsys, *words)
+    assert reported["sentence"] == sentence
+    assert reported["steps_kept"] == 5
+    assert reported["u_sigma_voxel"]["volumes"] > 0.0
 
 
 @pytest.mark.thorough
@@ -146,9 +146,12 @@ def test_settings_of_a_later_step_leave_what_was_made_before(again: Path, capsys
     earlier = told_by(again)["summaries"]
     with pytest.raises(OutputExistsError) as caught:
         run(again / "rig.yaml", again / "out")
-    told = str(caught.value)
-    assert "calibration.h5: exists and was made from other inputs or settings (correlation.windows was [[24, 24" in told
-    assert told.endswith(
+    reported = str(caught.value)
+    assert (
+        "calibration.h5: exists and was made from other inputs or settings (correlation.windows was [[24, 24"
+        in reported
+    )
+    assert reported.endswith(
         "--overwrite keeps it, as it depends on none of that; with it the run makes vectors again and keeps "
         "calibration.h5, weights.h5 and volumes"
     )
@@ -163,8 +166,8 @@ def test_settings_of_a_later_step_leave_what_was_made_before(again: Path, capsys
     run(again / "rig.yaml", again / "out", "--overwrite")
     assert list(states(again).values()) == ["recorded anew"] * 3 + ["made"]
     assert {name: data_of(again / "out" / name) for name in names} == before
-    told = told_by(again)
-    assert told["summaries"]["reconstruct"] == earlier["reconstruct"]
+    reported = told_by(again)
+    assert reported["summaries"]["reconstruct"] == earlier["reconstruct"]
     # What each carries is what a run from the beginning would have written, and it is kept from now on.
     carried = carried_record(again / "out" / "vectors.vtkhdf")
     assert {made["config"]["correlation"]["windows"][1][0] for made in carried["made_from"].values()} == {10}
@@ -205,8 +208,8 @@ def test_what_has_changed_since_a_result_was_made_is_named() -> None:
         ("version", "2", "lfpiv was 1, is 2"),
         ("command", "reconstruct page 1", "the command was reconstruct page 0, is reconstruct page 1"),
     ):
-        (told,) = differences(carried, carried | {key: value})
-        assert told.startswith(words)
+        (reported,) = differences(carried, carried | {key: value})
+        assert reported.startswith(words)
 
 
 def data_of(path: Path) -> dict[str, bytes]:
@@ -221,12 +224,12 @@ def data_of(path: Path) -> dict[str, bytes]:
 def test_a_torn_file_is_refused_or_made_again(again: Path) -> None:
     torn, whole = again / "out" / "weights.h5", (again / "out" / "weights.h5").read_bytes()
     torn.write_bytes(whole[:-1000])
-    told = told_by(again)["summaries"]
+    reported = told_by(again)["summaries"]
     with pytest.raises(OutputExistsError, match="step 2, build-weights"):
         run(again / "rig.yaml", again / "out")
     run(again / "rig.yaml", again / "out", "--overwrite")
     assert torn.read_bytes() == whole
-    assert told_by(again)["summaries"] == told
+    assert told_by(again)["summaries"] == reported
     assert [name for name, state in states(again).items() if state == "made"] == ["build-weights"]
 
 
@@ -254,8 +257,8 @@ def test_the_report_is_made_of_what_was_made(again: Path, monkeypatch: pytest.Mo
     for _ in range(2):
         run(again / "rig.yaml", again / "out", "--report")
     assert made == [(again / "out", {"pair_a.tif", "pair_b.tif", "white.tif", "board.tif"})]
-    told = told_by(again)
-    assert told["summaries"]["report"] == {"verdict": {"vectors": "good"}}
+    reported = told_by(again)
+    assert reported["summaries"]["report"] == {"verdict": {"vectors": "good"}}
 
 
 @pytest.mark.thorough
@@ -301,14 +304,14 @@ def test_the_verdict_is_the_same_whether_volumes_are_kept_or_not(again: Path, mo
         # 2 % of the pixels are clipped, which makes a warning in the records of volumes alone.
         tifffile.imwrite(path, np.minimum(frame * (4095.0 / np.percentile(frame, 98.0)), 4095.0).astype(np.uint16))
     shutil.rmtree(out / "volumes")
-    told = []
+    reported = []
     for keep in ("results", "all"):
         run(rig, out, "--keep", keep, "--overwrite", images=images)
         assert (out / "volumes").exists() == (keep == "all")
         summary = report(out, out / "page.html", overwrite=True, console=Console(quiet=True))
-        told.append((summary["verdict"], (out / "page.html").read_text().count("of its lit pixels are saturated")))
-    assert told == [({"calibration": "good", "images": "look", "vectors": "look"}, told[0][1])] * 2
-    assert told[0][1] > 0
+        reported.append((summary["verdict"], (out / "page.html").read_text().count("of its lit pixels are saturated")))
+    assert reported == [({"calibration": "good", "images": "look", "vectors": "look"}, reported[0][1])] * 2
+    assert reported[0][1] > 0
 
 
 @pytest.mark.parametrize(

@@ -92,9 +92,9 @@ def test_shards_together_give_what_one_command_gives(rig, whole, with_weights, o
     expected = {name: data for name, data in data_of(whole).items() if keep == "all" or "volumes" not in name}
     assert data_of(with_weights) == expected
     run(rig, with_weights, "--keep", keep)
-    told = json.loads((with_weights / "run.json").read_text())
-    assert {step["state"] for step in told["steps"].values()} == {"kept"}
-    assert told["figures"] == json.loads((whole / "run.json").read_text())["figures"]
+    reported = json.loads((with_weights / "run.json").read_text())
+    assert {step["state"] for step in reported["steps"].values()} == {"kept"}
+    assert reported["figures"] == json.loads((whole / "run.json").read_text())["figures"]
     assert data_of(with_weights) == expected
 
 
@@ -168,11 +168,11 @@ def planned(rig: Path, output: Path, capsys: pytest.CaptureFixture[str], *option
 
 
 def test_a_dry_run_before_there_is_anything(rig: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    told = planned(rig, tmp_path / "out", capsys, "--shard", "1/3")
+    reported = planned(rig, tmp_path / "out", capsys, "--shard", "1/3")
     assert not (tmp_path / "out").exists()
-    assert told["steps_to_make"] == ["calibrate-snapshot", "build-weights"]
-    assert (told["frames"], told["pairs"], told["to_make"]) == (2, 1, {"volumes": 2, "vectors": 1})
-    assert 0.0 < told["disk_mb"] < 3.0
+    assert reported["steps_to_make"] == ["calibrate-snapshot", "build-weights"]
+    assert (reported["frames"], reported["pairs"], reported["to_make"]) == (2, 1, {"volumes": 2, "vectors": 1})
+    assert 0.0 < reported["disk_mb"] < 3.0
     with pytest.raises(UsageError, match="a sequence is followed from frame to frame"):
         lfpiv("run", rig / "rig.yaml", rig / "images", *PHOTOGRAPHS, "--follow", "--shard", "1/2", "-o", tmp_path)
 
@@ -184,16 +184,16 @@ def test_a_dry_run_tells_what_is_left_and_writes_nothing(
     log = ("--log", tmp_path / "log")
     run(rig, with_weights, "--shard", "1/3", *log)
     before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")}
-    told = planned(rig, with_weights, capsys, *log)
+    reported = planned(rig, with_weights, capsys, *log)
     assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")} == before
-    assert (told["steps_to_make"], told["method"]) == ([], "volumes")
-    assert (told["to_make"], told["skipped"]) == ({"volumes": 4, "vectors": 2}, {"volumes": 2, "vectors": 1})
-    assert [Path(path).name for path in told["would_make"][4:]] == ["p1_a.vtkhdf", "p2_a.vtkhdf"]
+    assert (reported["steps_to_make"], reported["method"]) == ([], "volumes")
+    assert (reported["to_make"], reported["skipped"]) == ({"volumes": 4, "vectors": 2}, {"volumes": 2, "vectors": 1})
+    assert [Path(path).name for path in reported["would_make"][4:]] == ["p1_a.vtkhdf", "p2_a.vtkhdf"]
     written = sum(len(data) for name, data in data_of(whole).items() if name.startswith(("volumes", "vectors")))
-    assert told["disk_mb"] == pytest.approx(written * 2 / 3 / 1e6, rel=0.2)
-    assert told["seconds"] > 0.0
-    told = planned(rig, whole, capsys)
-    assert (told["to_make"], told["disk_mb"]) == ({"volumes": 0, "vectors": 0}, 0.0)
+    assert reported["disk_mb"] == pytest.approx(written * 2 / 3 / 1e6, rel=0.2)
+    assert reported["seconds"] > 0.0
+    reported = planned(rig, whole, capsys)
+    assert (reported["to_make"], reported["disk_mb"]) == ({"volumes": 0, "vectors": 0}, 0.0)
 
 
 @pytest.mark.thorough
@@ -201,8 +201,8 @@ def test_a_dry_run_without_volumes(rig: Path, with_weights: Path, capsys: pytest
     keep = ("--keep", "results")
     assert planned(rig, with_weights, capsys, *keep)["to_make"] == {"vectors": 3}
     run(rig, with_weights, "--shard", "2/3", *keep)
-    told = planned(rig, with_weights, capsys, *keep)
-    assert (told["to_make"], told["skipped"]) == ({"vectors": 2}, {"vectors": 1})
+    reported = planned(rig, with_weights, capsys, *keep)
+    assert (reported["to_make"], reported["skipped"]) == ({"vectors": 2}, {"vectors": 1})
     assert not any((with_weights / "volumes").iterdir())
 
 
@@ -259,11 +259,11 @@ def named(folder: Path, *names: str, whole: bool = True) -> list[Path]:
 
 def coming(*names: str) -> tuple[list[tuple[str, ...]], list[str]]:
     """Return the pairs, by name, that are told of frames that come one by one, and which of these are passed over."""
-    console, told = Console(quiet=True, warned=[]), []
+    console, reported = Console(quiet=True, warned=[]), []
     frames = [[Frame(Path(f"{name}.tif"), 0, 1)] for name in names]
     for pairs in coming_pairs(frames, images_seen, PairOptions(pairing="ab"), console, []):
-        told += [tuple(frame.stem for frame in pair) for pair in pairs]
-    return told, [Path(notice.about).stem for notice in console.warned or ()]
+        reported += [tuple(frame.stem for frame in pair) for pair in pairs]
+    return reported, [Path(notice.about).stem for notice in console.warned or ()]
 
 
 def test_pairs_of_running_numbers_begin_as_the_first_two_and_a_lost_one_shifts_nothing() -> None:
@@ -406,10 +406,10 @@ def test_an_interrupted_watch_keeps_what_is_done_and_goes_on(rig: Path, tmp_path
     assert not [path for path in output.rglob("*") if "partial" in path.name or "claim" in path.name]
     named(images, "2a", "2b")
     again = begun(rig / "rig.yaml", images, output, "--idle-s", 3)
-    told, _ = again.communicate(timeout=300.0)
-    assert again.returncode == 0, told
-    assert not any(line.startswith("1a  ") for line in told.splitlines())
-    assert any(line.startswith("2a  ") for line in told.splitlines())
+    reported, _ = again.communicate(timeout=300.0)
+    assert again.returncode == 0, reported
+    assert not any(line.startswith("1a  ") for line in reported.splitlines())
+    assert any(line.startswith("2a  ") for line in reported.splitlines())
     assert first.stat().st_mtime_ns == before
     steps = json.loads((output / "run.json").read_text())["steps"]
     assert {name: step["state"] for name, step in steps.items() if name != "report"}.keys() >= {"correlate"}

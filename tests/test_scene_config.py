@@ -232,12 +232,12 @@ def test_particles_are_fitted_through_a_scene_behind_square_lenses_alone(configu
 def test_weights_are_validated_through_a_scene(configured: Callable[[str], Config], tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
     configured(RIG + TUBE + "validation: {weights: {sample: 1}}\n")
-    told = validate.validate_weights(tmp_path / "rig.yaml", tmp_path / "report")
-    assert told["voxels"] == 6
+    reported = validate.validate_weights(tmp_path / "rig.yaml", tmp_path / "report")
+    assert reported["voxels"] == 6
     # Near the tube's axis; 5 million rays alone are off by 0.045.
-    assert told["factorised_to_converged.l1_largest"] < 0.03
-    assert told["on_demand_to_converged.l1_largest"] < 0.03
-    assert 0.03 < told["ray_count_to_converged.l1_mean"] < 0.07
+    assert reported["factorised_to_converged.l1_largest"] < 0.03
+    assert reported["on_demand_to_converged.l1_largest"] < 0.03
+    assert 0.03 < reported["ray_count_to_converged.l1_mean"] < 0.07
     assert (tmp_path / "report" / "weights_columns.png").stat().st_size > 10_000
     configured(RIG.replace("voxel_mm: 0.1", "voxel_mm: 0.1, centre_mm: [0, 20, 0]") + TUBE)
     with pytest.raises(ConfigError, match="no voxel of the volume lies wholly in the fluid"):
@@ -246,17 +246,17 @@ def test_weights_are_validated_through_a_scene(configured: Callable[[str], Confi
 
 def test_a_calibration_moves_the_scene_and_the_pipe(configured: Callable[[str], Config], tmp_path: Path) -> None:
     """Faces, and the pipe with them, lie in the resolved config where the calibration has them."""
-    told = configured(RIG + TUBE + "pipe: {radius_mm: 5.0}")
-    camera = told.camera_model()
+    reported = configured(RIG + TUBE + "pipe: {radius_mm: 5.0}")
+    camera = reported.camera_model()
     still, turn = np.zeros(3), np.array([0.0, 0.2, 0.3])
-    pose = ScenePose(np.array([0.0, 0.15, -0.2]), turn, still, still, still, told.scene_fingerprint())
+    pose = ScenePose(np.array([0.0, 0.15, -0.2]), turn, still, still, still, reported.scene_fingerprint())
     found = replace(model.calibrate(model.Photographs(), None, model.DataSheet(camera=camera)), scene=pose)
     write_calibration(tmp_path / "refined.h5", found, {}, False)
     read = open_calibration(tmp_path / "refined.h5")
     assert read.scene is not None
     assert read.summary()["scene_turn_deg"] == turn.tolist()
-    config = told.with_scene_of(read)
-    moved, before = config.scene_space(), told.scene_space()
+    config = reported.with_scene_of(read)
+    moved, before = config.scene_space(), reported.scene_space()
     assert moved is not None
     assert before is not None
     assert moved == before.moved(pose.motion)
@@ -270,7 +270,7 @@ def test_a_calibration_moves_the_scene_and_the_pipe(configured: Callable[[str], 
         config.with_scene_of(read)
     with pytest.raises(ConfigError, match="scene: is missing"):
         configured(RIG).with_scene_of(read)
-    assert told.with_scene_of(replace(read, scene=None)) is told
+    assert reported.with_scene_of(replace(read, scene=None)) is reported
     assert plan_of(config, None).source == moved
 
 

@@ -315,12 +315,12 @@ def simulated_pipe(folder: Path, name: str, *replaced: str) -> tuple[Particles, 
 @pytest.mark.thorough
 @pytest.mark.parametrize(("name", "seen_as"), [("pipe", 1.33), ("pipe_box", 1.0)])
 def test_a_pipe_is_seeded_and_seen_through_its_walls(tmp_path: Path, name: str, seen_as: float) -> None:
-    truth, told = simulated_pipe(tmp_path, name)
+    truth, reported = simulated_pipe(tmp_path, name)
     distance = np.hypot(truth.positions_mm[:, 1], truth.positions_mm[:, 2])
     assert distance.max() <= 5.0
     # 60 in the volume's pipe, and some beside it along the pipe
     assert 60 <= len(distance) <= 75
-    assert told["particles_unseen"] == 0
+    assert reported["particles_unseen"] == 0
     axis = 1.0 - (distance / 5.0) ** 2
     # places are stored with seven digits
     assert truth.velocities_m_s == pytest.approx(np.outer(2.0 * 0.1082 * axis, [1.0, 0.0, 0.0]), abs=1e-6)
@@ -340,9 +340,9 @@ def test_a_pipe_is_seeded_and_seen_through_its_walls(tmp_path: Path, name: str, 
 @pytest.mark.thorough
 def test_tracers_that_no_light_comes_from_are_counted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Behind a wall of half a millimetre water is hidden beyond R_out / n."""
-    truth, told = simulated_pipe(tmp_path, "pipe", "radius_mm: 7.0", "radius_mm: 5.5")
+    truth, reported = simulated_pipe(tmp_path, "pipe", "radius_mm: 7.0", "radius_mm: 5.5")
     distance = np.hypot(truth.positions_mm[:, 1], truth.positions_mm[:, 2])
-    assert 0 < told["particles_unseen"] <= np.sum(distance > 5.5 / 1.33)
+    assert 0 < reported["particles_unseen"] <= np.sum(distance > 5.5 / 1.33)
     assert "send no light to the lens" in capsys.readouterr().err
 
 

@@ -29,7 +29,7 @@ from lfpiv_cli.verbs import checks
 from lfpiv_cli.verbs.checks import Quality, calibration_notices, field_notices, pair_notices, tracers_per_window
 from lfpiv_cli.verbs.field import FieldOptions, fit_flow, read_places
 from lfpiv_cli.verbs.fields import fit_notices, fitted, samples_of_tracks
-from tests.commands import CONFIG, run, sample_rig, told
+from tests.commands import CONFIG, run, sample_rig, summary_of
 from tests.test_particle_stage import HIGH, LOW, write_frames
 from tests.vector_fields import pair_tracks, points_of
 
@@ -98,7 +98,9 @@ def test_an_ensemble_is_one_field(volumes: list[Path], tmp_path: Path, capsys: p
     run("correlate", *volumes[:4], "--pairing", "ab", "--ensemble", "-o", tmp_path / "together.vtkhdf")
     together = open_vectors(tmp_path / "together.vtkhdf")
     folder, mean = tmp_path / "each", tmp_path / "mean.vtkhdf"
-    summary = told(capsys, "correlate", *volumes[:4], "--pairing", "ab", "--derived", "--mean", mean, "-o", folder)
+    summary = summary_of(
+        capsys, "correlate", *volumes[:4], "--pairing", "ab", "--derived", "--mean", mean, "-o", folder
+    )
     each = [open_vectors(folder / f"a{number}.vtkhdf") for number in range(2)]
     expected = np.mean([field.displacement_voxel for field in each], axis=0)
     np.testing.assert_allclose(open_vectors(mean).displacement_voxel, expected, atol=1e-12)
@@ -121,7 +123,7 @@ def test_an_ensemble_is_one_field(volumes: list[Path], tmp_path: Path, capsys: p
 
 def warned(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[dict[str, Any], list[str]]:
     """Run correlate; return its summary and the codes of what it warns of."""
-    summary = told(capsys, "correlate", *arguments, "--overwrite")
+    summary = summary_of(capsys, "correlate", *arguments, "--overwrite")
     return summary, [each["code"] for each in summary["warnings"]]
 
 
@@ -252,7 +254,7 @@ def fitted_by(
 
     def fit(*options: object, **how: Any) -> dict[str, Any]:
         tracks = write_tracks(tmp_path / "tracks.vtkhdf", rng, **how)
-        return told(capsys, "field", tracks, *options, "-o", tmp_path / "field.vtkhdf")
+        return summary_of(capsys, "field", tracks, *options, "-o", tmp_path / "field.vtkhdf")
 
     return fit
 
@@ -350,10 +352,10 @@ def test_measurements_of_one_flow_need_the_same_coordinates_alone(
 def test_velocities_at_points_and_gradients(tmp_path: Path, fitted_by: Callable[..., dict[str, Any]]) -> None:
     points = tmp_path / "points.csv"
     points.write_text("x,y,z\n0.1, 0.2, 0.3\n\n-0.5,0,1e-1\n", encoding="utf-8")
-    told = fitted_by("--at", points, "--derived")
+    reported = fitted_by("--at", points, "--derived")
     # the flow moves as a whole: what is left is of the errors, 0.01 mm in 2 ms at most
-    assert 0.0 <= told["kinetic_energy_m2_s2"] < 0.5 * 0.005**2
-    assert "dissipation_m2_s3" not in told
+    assert 0.0 <= reported["kinetic_energy_m2_s2"] < 0.5 * 0.005**2
+    assert "dissipation_m2_s3" not in reported
     header, *lines = (tmp_path / "field_at.csv").read_text(encoding="utf-8").splitlines()
     rows = np.array([[float(word) for word in line.split(",")] for line in lines])
     assert header.split(",")[3] == "u_m_s"

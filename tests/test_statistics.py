@@ -22,7 +22,7 @@ from lfpiv_cli.grid import FOCAL_POINT, Grid
 from lfpiv_cli.synthetic.flows import pipe, random_modes, square_duct
 from lfpiv_cli.verbs.moments import FlowStatistics, notices_of, of_fields, of_tracks, parse_profile, profile_on
 from lfpiv_cli.verbs.plot import figures_of
-from tests.commands import CONFIG, run, sample_rig, told
+from tests.commands import CONFIG, run, sample_rig, summary_of
 from tests.vector_fields import field_on, pair_tracks
 
 SHAPE, DT_S, VOXEL_MM = (2, 3, 4), 1e-3, (0.1, 0.1, 0.1)
@@ -379,7 +379,7 @@ def folder(tmp_path: Path, rng: np.random.Generator) -> Path:
 
 def test_files_become_one_of_statistics(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = folder / "s.vtkhdf"
-    summary = told(capsys, "statistics", folder / "vectors", "--profile", "x@y=0.8", "-o", out)
+    summary = summary_of(capsys, "statistics", folder / "vectors", "--profile", "x@y=0.8", "-o", out)
     assert (summary["files"], summary["pairs"], summary["places"]) == (12, 12, 24)
     assert [each["code"] for each in summary["warnings"]] == ["few-independent"]
     paths = [folder / "vectors" / f"v{number}.vtkhdf" for number in range(12)]
@@ -403,11 +403,14 @@ def test_files_become_one_of_statistics(folder: Path, capsys: pytest.CaptureFixt
     np.testing.assert_array_equal(again.mean.velocity, open_vectors(out).velocity)
     with pytest.raises(OutputExistsError):
         run("statistics", folder / "vectors", "-o", out)
-    assert told(capsys, "statistics", folder / "vectors", "--profile", "x@y=0.8", "-o", out, "--resume")["skipped"] == 1
+    assert (
+        summary_of(capsys, "statistics", folder / "vectors", "--profile", "x@y=0.8", "-o", out, "--resume")["skipped"]
+        == 1
+    )
     with pytest.raises(OutputExistsError, match="other inputs or settings"):
         run("statistics", folder / "vectors", "-o", out, "--resume")
     # One pair tells no fluctuations, and its figures no convergence.
-    single = told(capsys, "statistics", paths[0], "-o", folder / "one.vtkhdf")
+    single = summary_of(capsys, "statistics", paths[0], "-o", folder / "one.vtkhdf")
     assert (single["pairs"], single["kinetic_energy_m2_s2"]) == (1, None)
     assert "convergence" in figures_of(out)
     assert {"moments", "profile"} <= set(figures_of(folder / "one.vtkhdf"))
@@ -423,7 +426,7 @@ def test_files_become_one_of_statistics(folder: Path, capsys: pytest.CaptureFixt
 def test_tracks_count_where_they_are_and_the_page_shows_them(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("matplotlib")
     out = folder / "s.vtkhdf"
-    summary = told(capsys, "statistics", folder / "tracks", "--bin-mm", "1x1x2", "--fewest", 10, "-o", out)
+    summary = summary_of(capsys, "statistics", folder / "tracks", "--bin-mm", "1x1x2", "--fewest", 10, "-o", out)
     assert (summary["pairs"], summary["places"], summary["rejected"]) == (12, 3 * 2 * 2, 0)
     field = open_vectors(out)
     assert field.grid.spacing_mm == (1.0, 1.0, 2.0)

@@ -176,9 +176,9 @@ def test_images_that_contradict_each_other_are_told() -> None:
     for alike in (frames[:1], [frames[0]] * 2):
         size = TracerSize(0.05, 0.05, 0.002, True, frames=tuple(alike))
         assert size_notices(settings, size) == []
-    (told,) = size_notices(settings, TracerSize(0.05, 0.05, 0.002, True, frames=tuple(frames)))
-    assert (told.code, told.about) == ("images-differ", "reconstruction.diffusion_px")
-    assert "0.3 ± 0.02 px by one image and 0.5 ± 0.02 px by another" in told.text
+    (reported,) = size_notices(settings, TracerSize(0.05, 0.05, 0.002, True, frames=tuple(frames)))
+    assert (reported.code, reported.about) == ("images-differ", "reconstruction.diffusion_px")
+    assert "0.3 ± 0.02 px by one image and 0.5 ± 0.02 px by another" in reported.text
     apart = (frames[0], replace(frames[1], measured_mm=0.07))
     both = size_notices(settings, TracerSize(0.05, 0.05, 0.002, True, frames=apart))
     assert [each.about for each in both] == ["reconstruction.particle_diameter_mm", "reconstruction.diffusion_px"]
@@ -262,8 +262,8 @@ def test_crowded_tracers_tell_diffusion_less_surely_and_others_what_is_usual(rng
     both = together_of([shown, shown._replace(crowd=1.7)])
     assert both.sigma_px == pytest.approx(many.sigma_px, rel=0.05)
     # What images do not tell is taken as usual.
-    told, untold = together_of([forms(20, rng)]), together_of([forms(20, rng, sure=1e-3)])
-    assert told.reported
+    reported, untold = together_of([forms(20, rng)]), together_of([forms(20, rng, sure=1e-3)])
+    assert reported.reported
     assert not untold.reported
     assert untold.diffusion_px == pytest.approx(USUAL_DIFFUSION_PX, abs=0.05)
     # Sizes of points are not below 0, and diffusion is then that of points.

@@ -25,7 +25,7 @@ from lfpiv_cli.validation.flow import Duct, Measured, cumulative_distribution, f
 from lfpiv_cli.validation.methods import lower_error
 from lfpiv_cli.verbs import validate
 from lfpiv_cli.verbs.validate import _truth_of_particles, light_notices, validate_flow
-from tests.commands import CONFIG, run, sample_rig, told
+from tests.commands import CONFIG, run, sample_rig, summary_of
 from tests.vector_fields import field_on
 
 SHAPE = (4, 3, 5)
@@ -167,9 +167,9 @@ def test_table_4_takes_the_paper_s_slices_of_a_duct() -> None:
 
     panel = slices_figure({"measured": Measured(field, truth, everywhere)}, duct).axes[0]
     profile = 0.1 * (1.0 + 0.01 * across + 0.02 * -2.0)
-    told = {line.get_label(): line for line in panel.lines}
-    np.testing.assert_allclose(told["measured"].get_ydata(), profile)
-    np.testing.assert_allclose(told["true, at the windows"].get_ydata(), 0.1)
+    reported = {line.get_label(): line for line in panel.lines}
+    np.testing.assert_allclose(reported["measured"].get_ydata(), profile)
+    np.testing.assert_allclose(reported["true, at the windows"].get_ydata(), 0.1)
     assert "(paper 3.51 %)" in panel.get_title()
     # An analytic flow is a line from wall to wall; another duct is not held against the paper's.
     for other in (replace(duct, width_mm=8.0), replace(duct, mean_velocity_m_s=0.2)):
@@ -206,9 +206,9 @@ def test_a_pipes_figures_go_by_the_distance_from_its_axis() -> None:
     from lfpiv_cli.validation.methods import radius_figure
 
     panel = radius_figure({"measured": field}, wall, 0.1).axes[0]
-    told = {line.get_label(): line for line in panel.lines}
-    assert told["true, analytic"].get_ydata()[[0, -1]] == pytest.approx([0.2, 0.0])
-    assert len(told["measured"].get_xdata()) == inside.sum() - 1
+    reported = {line.get_label(): line for line in panel.lines}
+    assert reported["true, analytic"].get_ydata()[[0, -1]] == pytest.approx([0.2, 0.0])
+    assert len(reported["measured"].get_xdata()) == inside.sum() - 1
 
 
 @pytest.mark.parametrize("what", ["shape", "nothing inside", "truth"])
@@ -277,10 +277,10 @@ def test_pictures_show_truth_and_methods_on_one_scale(methods: dict[str, Measure
     np.testing.assert_allclose(shown[1:], 1e3 * error[SHAPE[0] // 2, 1:, :, 1])
     assert np.isnan(shown[0]).all()
     panel = np.array(profiles_figure(methods).axes[:9]).reshape(3, 3)[1, 0]
-    told = {line.get_label(): line.get_ydata() for line in panel.lines}
+    reported = {line.get_label(): line.get_ydata() for line in panel.lines}
     for name, scale in (("true, at the windows", 1.0), ("volumes", 1.1), ("particles", 1.0)):
-        np.testing.assert_allclose(told[name], scale * truth[0, 1, :, 1])
-    assert "true, analytic" not in told
+        np.testing.assert_allclose(reported[name], scale * truth[0, 1, :, 1])
+    assert "true, analytic" not in reported
 
 
 def test_an_analytic_flow_is_a_line_beyond_the_outer_windows(inside: Flags) -> None:
@@ -410,7 +410,9 @@ def test_the_truth_is_a_flow_or_that_of_particles(
         velocities = shear(rate_per_s, velocity_m_s=(0.12, 0.0, 0.0))(places)
         write_particles(particles, Particles(places, velocities, np.ones(500)), overwrite=True)
         report = tmp_path / f"{rig.stem} {rate_per_s}"
-        summary = told(capsys, "validate", "flow", rig, "--vectors", vectors, "--particles", particles, "-o", report)
+        summary = summary_of(
+            capsys, "validate", "flow", rig, "--vectors", vectors, "--particles", particles, "-o", report
+        )
         assert summary["truth"] == written(report)["truth"] == truth
         # In words, for people; all figures are with -v.
         words = rf"60 of 60 vectors valid; beside the {truth}: mean along .* % off; .*% of .* rms of u, v, w .* voxel\."

@@ -143,25 +143,25 @@ def test_places_behind_other_faces_show_the_same_rays(scene: MovableScene, rng: 
     # There and back again is no way, and along the pipe nothing else moves than along it.
     own = seeded(60, rng)
     places = scene.camera.to_image_axes(own[np.hypot(own[:, 1], own[:, 2]) < 4.5])
-    told, moved = scene.faces(np.zeros(4)), scene.faces(TRUTH)
+    reported, moved = scene.faces(np.zeros(4)), scene.faces(TRUTH)
     radius = scene.camera.aperture_radius_mm
-    there, seen = moved_places(places, told, moved, radius)
+    there, seen = moved_places(places, reported, moved, radius)
     assert seen.all()
     assert 0.02 < np.abs(there - places).max() < 0.4
     # Rays of another place are not quite the same, which is what images tell the scene by: 3 um are left.
-    back, _ = moved_places(there, moved, told, radius)
+    back, _ = moved_places(there, moved, reported, radius)
     np.testing.assert_allclose(back, places, atol=0.01)
-    np.testing.assert_array_equal(moved_places(places, told, told, radius)[0], places)
+    np.testing.assert_array_equal(moved_places(places, reported, reported, radius)[0], places)
     wall = scene.camera.to_image_axes(np.array([[0.0, 0.0, -5.2], [0.0, 0.0, 5.2], [0.0, 0.0, 5.0]]))
     still = np.zeros(4)
-    told = scene.faces(still)
-    assert moved_places(wall, told, told, scene.camera.aperture_radius_mm)[1].all()
-    as_it_is = told._replace(beyond_mm=0.0)
+    reported = scene.faces(still)
+    assert moved_places(wall, reported, reported, scene.camera.aperture_radius_mm)[1].all()
+    as_it_is = reported._replace(beyond_mm=0.0)
     assert moved_places(wall, as_it_is, as_it_is, 12.5)[1].tolist() == [False, False, True]
     # The rays of the fluid go on straight: what is seen changes smoothly across the wall.
     across = scene.camera.to_image_axes(np.column_stack([np.zeros((5, 2)), 5.0 + 0.01 * np.arange(-2.0, 3.0)]))
     through = scene.faces(TRUTH)
-    found, _ = moved_places(across, told, through, scene.camera.aperture_radius_mm)
+    found, _ = moved_places(across, reported, through, scene.camera.aperture_radius_mm)
     np.testing.assert_allclose(np.diff(found, n=2, axis=0), 0.0, atol=1e-5)
 
 
@@ -297,10 +297,10 @@ def test_what_contradicts_the_scene_is_told_with_both_figures(scene: MovableScen
     sigma = right.radius_sigma_mm
     for radius, codes in ((5.0 + 3.9 * sigma, []), (5.0 + 4.1 * sigma, ["scene-radius"])):
         found = together(replace(refined(scene, rng, TRUTH), wall=replace(right.wall, radius_mm=radius)))
-        told = scene_notices(found)
-        assert [each.code for each in told] == codes
-    assert f"{radius:.3f} ± {sigma:.3f} mm" in told[0].text
-    assert "radius_mm is 5:" in told[0].text
+        reported = scene_notices(found)
+        assert [each.code for each in reported] == codes
+    assert f"{radius:.3f} ± {sigma:.3f} mm" in reported[0].text
+    assert "radius_mm is 5:" in reported[0].text
     # The images count as far as the radius is right, and the wall for the rest.
     assert found.nuisances_sigma.scene[1] > 4.0 * sigma
     assert found.covariance[1, 1] > 0.1 * found.by_wall_covariance[1, 1] > 10.0 * right.covariance[1, 1]

@@ -136,9 +136,11 @@ def test_what_is_missing_or_of_another_kind_is_named(tmp_path: Path, weights: by
 
 def test_tracing_through_what_cannot_be_and_an_earlier_version_are_named(tmp_path: Path, weights: WeightsFile) -> None:
     for media in ((0.5, 1.0, 1.0), (1.0, np.nan, 1.0), (1.0, 1.0, 1e300)):
-        told = dict(zip(("air", "window", "fluid"), media, strict=True))
-        told |= {"method": np.bytes_("ert"), "refraction": np.bytes_("exact")}
-        code, said = wrong(weights, tmp_path, lambda file, told=told: file.create_group("on_demand").attrs.update(told))
+        reported = dict(zip(("air", "window", "fluid"), media, strict=True))
+        reported |= {"method": np.bytes_("ert"), "refraction": np.bytes_("exact")}
+        code, said = wrong(
+            weights, tmp_path, lambda file, reported=reported: file.create_group("on_demand").attrs.update(reported)
+        )
         assert (code, "not a whole weights file" in said) == (4, True)
     code, said = wrong(weights, tmp_path, lambda file: file.attrs.__setitem__("format_version", 3))
     assert code == 4

@@ -296,7 +296,7 @@ def test_prediction_is_the_median_of_neighbours_carried_by_median_slopes(rng: np
     field = rng.standard_normal((4, 5, 4, 3))
     counted = rng.random(field.shape[:3]) < 0.9
     usable = counted & (rng.random(field.shape[:3]) < 0.7)
-    told = predict(field, usable, counted, np.arange(usable.size))
+    reported = predict(field, usable, counted, np.arange(usable.size))
     known = np.pad(np.where(usable[..., np.newaxis], field, np.nan), [(1, 1)] * 3 + [(0, 0)], constant_values=np.nan)
     places = np.stack(np.meshgrid(*[[-1, 0, 1]] * 3, indexing="ij"), axis=-1)
     for number, (z, y, x) in enumerate(np.ndindex(usable.shape)):
@@ -312,6 +312,6 @@ def test_prediction_is_the_median_of_neighbours_carried_by_median_slopes(rng: np
         carried = (cube - places @ np.array(slopes))[np.isfinite(cube[..., 0])]
         assert len(carried) > 0
         middle = np.median(carried, axis=0)
-        np.testing.assert_allclose(told[0][number], middle, atol=1e-12)
-        np.testing.assert_allclose(told[1][number], np.median(np.abs(carried - middle), axis=0), atol=1e-12)
-        assert told[2][number] == pytest.approx(len(carried) / seen.sum())
+        np.testing.assert_allclose(reported[0][number], middle, atol=1e-12)
+        np.testing.assert_allclose(reported[1][number], np.median(np.abs(carried - middle), axis=0), atol=1e-12)
+        assert reported[2][number] == pytest.approx(len(carried) / seen.sum())

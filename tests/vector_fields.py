@@ -32,7 +32,11 @@ def field_on(
 
 
 def points_of(
-    format_name: str, rng: np.random.Generator, count: int = 12, provenance: dict[str, Any] | None = None, **told: Any
+    format_name: str,
+    rng: np.random.Generator,
+    count: int = 12,
+    provenance: dict[str, Any] | None = None,
+    **reported: Any,
 ) -> Points:
     """Return points with every array that their format has; three of each track or frame."""
     wide = {"covariance_mm2": 6, "displacement_covariance_mm2": 6, "velocity": 3, "velocity_sigma": 3}
@@ -42,7 +46,7 @@ def points_of(
         name: np.arange(count) // 3 if name in whole else rng.random((count, wide[name]) if name in wide else count)
         for name in (*UNITS[format_name], *OPTIONAL.get(format_name, {}))
     }
-    return Points(rng.random((count, 3)), arrays, FOCAL_POINT, told, provenance or {})
+    return Points(rng.random((count, 3)), arrays, FOCAL_POINT, reported, provenance or {})
 
 
 def pair_tracks(
