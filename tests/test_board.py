@@ -159,6 +159,23 @@ def test_pose_of_exact_dots_is_exact_with_dots_missing_and_dirt(table2: Camera) 
     assert first[1] < -1.5
 
 
+def test_a_row_in_the_rim_leaves_the_middle_in_doubt_and_its_errors_say_so(table2: Camera) -> None:
+    board = BoardGeometry((7, 5), 1.0, 0.2)
+    dots = dot_places(board, 3.0, (0.4, -0.2), (2.0, -3.0))
+    (_, whole), (kept, cut) = (
+        (seen, pose_of_dots(seen, np.full(seen.shape, 1e-3), -seen[:, :2], table2, board))
+        for seen in (dots, dots.reshape(7, 5, 3)[:, 1:].reshape(-1, 3))
+    )
+    assert np.all(whole.offset_sigma_mm < 2e-3)
+    assert len(cut.indices) == len(kept)
+    # Two windows of five rows hold the four: the middle is one of theirs, a spacing apart.
+    off = np.array([*cut.offset_mm, cut.z0_mm]) - (0.4, -0.2, 3.0)
+    sigma = np.array([*cut.offset_sigma_mm, cut.z0_sigma_mm])
+    assert abs(off[1]) == pytest.approx(1.0, abs=0.01) or off[1] == pytest.approx(0.0, abs=1e-6)
+    np.testing.assert_allclose(sigma[1:], np.sqrt(0.5) * np.array([1.0, np.tan(np.deg2rad(3.0))]), rtol=0.01)
+    assert sigma[0] < 0.01
+
+
 def test_a_tilt_that_its_error_explains_changes_no_magnification(table2: Camera, rng: np.random.Generator) -> None:
     """Of few dots whose depths are little known the slopes are errors, which always make the spacing longer."""
     dots, found = dot_places(BOARD, 2.0, (0.0, 0.0), (0.5, -0.5)), []

@@ -340,11 +340,13 @@ def test_one_image_twice_and_few_links_are_told() -> None:
         assert [notice.code for notice in few_notices(counts, ("a", "b"), summary, tracks(1e-3))] == codes
 
 
-def told_of_board(camera: Camera, board: BoardGeometry, found: int, z_mm: float, magnification: float) -> list[Notice]:
-    """Return what is told of a board of which so many points were found, all of them where the plane has them."""
+def told_of_board(
+    camera: Camera, board: BoardGeometry, found: int, z_mm: float, magnification: float, tilt_deg: float = 0.0
+) -> list[Notice]:
+    """Return what is told of a board of which so many points, row by row, were found, where the plane has them."""
     zeros, none = np.zeros((found, 3)), np.zeros(2)
-    seen = (zeros[:, :2].astype(np.int64), zeros, zeros, zeros, zeros[:, :2])
-    pose = BoardPose(*seen, z_mm, 0.0, none, none, 0.0, 0.0, none, none, magnification, 0.0)
+    seen = (np.stack(np.divmod(np.arange(found), board.dots[0])[::-1], axis=1), zeros, zeros, zeros, zeros[:, :2])
+    pose = BoardPose(*seen, z_mm, 0.0, np.array([0.0, tilt_deg]), none, 0.0, 0.0, none, none, magnification, 0.0)
     return list(board_notices(pose, board, camera, Media(1.0, 1.49, 1.33)))
 
 
@@ -364,14 +366,19 @@ def test_boards_with_doubts_are_told(table2: Camera) -> None:
     board = BoardGeometry((5, 4), 0.6, 0.2)
     # Dots 0.5 mm apart that are said to be 0.6 show a magnification of 0.836.
     cases = (
-        (19, -1.0, []),
-        (20, -1.0112, ["magnification"]),
-        (20, -1.009, []),
-        (11, -1.0, ["board-incomplete"]),
-        (20, -0.836, ["magnification"]),
+        (19, -1.0, 0.0, []),
+        (20, -1.0112, 0.0, ["magnification"]),
+        (20, -1.009, 0.0, []),
+        # One row that is not seen leaves the middle 0.6 mm of the board in doubt, by its tilt 0.016 mm of depth.
+        (15, -1.0, 0.0, []),
+        (15, -1.0, 1.5, []),
+        (15, -1.0, 1.55, ["board-incomplete"]),
+        (16, -1.0, 1.55, []),
+        (10, -1.0, 0.0, ["board-incomplete"]),
+        (20, -0.836, 0.0, ["magnification"]),
     )
-    for found, magnification, codes in cases:
-        assert [each.code for each in told_of_board(table2, board, found, 5.0, magnification)] == codes
+    for found, magnification, tilt_deg, codes in cases:
+        assert [each.code for each in told_of_board(table2, board, found, 5.0, magnification, tilt_deg)] == codes
 
 
 def told_of(**measured: object) -> list[Notice]:

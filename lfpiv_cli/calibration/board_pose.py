@@ -277,8 +277,22 @@ def pose_of_dots(
         dots_px=camera.mm_to_px(camera.micro_image_scale * shown),
         k1_per_mm2=k1,
         k1_sigma_per_mm2=k1_sigma,
-        **lengths_and_angles(fit, camera),
+        **lengths_and_angles(fit, camera, np.zeros(2) if numbers is not None else middle_doubt_mm(indices, board)),
     )
+
+
+def rows_unseen(indices: Integers, board: BoardGeometry) -> Integers:
+    """Return how many columns and rows (2,) of a board's dots are none of those found (n, 2), on one side or both."""
+    return np.asarray(np.array(board.dots) - np.ptp(indices, axis=0) - 1, dtype=np.int64)
+
+
+def middle_doubt_mm(indices: Integers, board: BoardGeometry) -> Floats:
+    """Return how far (2,) the board's middle may be from where it is taken to be along its rows and columns, rms.
+
+    On which side what is not seen lies no dot tells; `best_window` shares it between both.
+    """
+    off = [np.arange(unseen + 1) - unseen // 2 for unseen in rows_unseen(indices, board).tolist()]
+    return board.spacing_mm * np.array([np.sqrt(np.mean(each**2)) for each in off])
 
 
 def lens_in_scene_mm(camera: Camera) -> tuple[float, float]:
@@ -425,10 +439,11 @@ def best_window(indices: Integers, dots: tuple[int, int]) -> tuple[Integers, Fla
     return best, ((indices >= best) & (indices < best + size)).all(axis=1)
 
 
-def lengths_and_angles(fit: FlatFit, camera: Camera) -> dict[str, Any]:
+def lengths_and_angles(fit: FlatFit, camera: Camera, doubt_mm: Floats) -> dict[str, Any]:
     """Return the fitted centre and step vectors as the lengths and angles of `BoardPose` with their standard errors.
 
     What the dots have in common may differ from one side of the board to the other as well: it counts for the tilt.
+    `doubt_mm` (2,) is how far along rows and columns the centre may be from where it is taken to be.
     """
     lens, lens_depth = lens_in_scene_mm(camera)
     coarse = max(1.0, COARSE_LENS_PX * camera.pixel_mm / float(camera.lattice.pitch.min())) ** 2
@@ -437,6 +452,7 @@ def lengths_and_angles(fit: FlatFit, camera: Camera) -> dict[str, Any]:
     common_slope = common_depth_mm / fit.half_span_mm
     slope_error = np.hypot(fit.sigma[1:, 2], common_slope)
     slope = np.linalg.solve(steps[:, :2], steps[:, 2])
+    centre_error = np.sqrt(fit.sigma[0] ** 2 + doubt_mm**2 @ steps**2)
     step_error = float(np.mean(fit.sigma[1:, :2])) / float(np.sqrt(2.0))
     # A tilt shortens the dots' spacing by half its slope's square; one that may be an error alone is not reckoned with.
     risen2, unsure2 = steps[:, 2] ** 2, (TILT_SIGMAS * slope_error) ** 2
@@ -447,13 +463,13 @@ def lengths_and_angles(fit: FlatFit, camera: Camera) -> dict[str, Any]:
     turn = np.array([np.arctan2(steps[0, 1], steps[0, 0]), np.arctan2(-steps[1, 0], steps[1, 1])])
     return {
         "z0_mm": float(centre[2]),
-        "z0_sigma_mm": float(np.hypot(fit.sigma[0, 2], common_depth_mm)),
+        "z0_sigma_mm": float(np.hypot(centre_error[2], common_depth_mm)),
         "tilt_deg": np.rad2deg(np.arctan(slope)),
         "tilt_sigma_deg": np.rad2deg(slope_error / (1.0 + slope**2)),
         "rotation_deg": float(np.rad2deg(turn.mean())),
         "rotation_sigma_deg": float(np.rad2deg(step_error)),
         "offset_mm": centre[:2],
-        "offset_sigma_mm": np.hypot(fit.sigma[0, :2], common_mm),
+        "offset_sigma_mm": np.hypot(centre_error[:2], common_mm),
         "magnification": camera.magnification * float(stretch.mean()),
         "magnification_sigma": abs(camera.magnification) * float(np.linalg.norm(scale_error)),
     }

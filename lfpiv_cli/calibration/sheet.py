@@ -10,7 +10,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from lfpiv_cli.calibration.board_pose import BoardGeometry, BoardPose, lens_in_scene_mm, off_focus_mm
+from lfpiv_cli.calibration.board_pose import BoardGeometry, BoardPose, lens_in_scene_mm, off_focus_mm, rows_unseen
 from lfpiv_cli.calibration.lattice import EXPONENTS, LatticeFit
 from lfpiv_cli.calibration.light_checks import LARGEST_FIELD_DEPTH, field_depth
 from lfpiv_cli.errors import ConfigError, InputError
@@ -30,8 +30,8 @@ ENTRANCE_PUPIL_TOLERANCE = 0.03
 # A board of another spacing, or in another medium, is off by a tenth or more; a lens that was focused by hand by a few
 # per cent, and then all that was planned by the rig file is as far off. Boards tell magnifications to some 0.1 %.
 MAGNIFICATION_TOLERANCE = 0.01
-# Share of a board's points that are found without a word: an origin may be left out, some may lie in dirt.
-FEWEST_POINTS = 0.8
+# Of a board that nearly fills the view a row may lie in the rim; more that are not seen are another board's.
+MOST_ROWS_UNSEEN = 1
 # The standard errors of a board's place are from how its points scatter about it; of six, a third of the true error was
 # stated of the magnification.
 ENOUGH_POINTS = 9
@@ -141,9 +141,16 @@ def entrance_pupil_notices(found_mm: float | None, sigma_mm: float | None, camer
 def board_notices(pose: BoardPose, board: BoardGeometry, camera: Camera, media: Media) -> Iterator[Notice]:
     """Say what speaks against a board as it was found, and what it shows that the data sheet has otherwise."""
     (across, down), found, dots = board.dots, pose.dots_found, board.pattern == "dots"
-    if dots and found < FEWEST_POINTS * across * down:
+    depth_unit = lens_in_scene_mm(camera)[1]
+    unseen, slope = rows_unseen(pose.indices, board), np.tan(np.deg2rad(pose.tilt_deg))
+    off_mm = board.spacing_mm * float(np.abs(unseen * slope).sum())
+    if dots and (unseen.max() > MOST_ROWS_UNSEEN or off_mm > LARGEST_FIELD_DEPTH * depth_unit):
         # Which part it is its dots do not tell.
-        text = f"{found} of the board's {across} x {down} points were found: where its middle lies is a guess"
+        across_seen, down_seen = np.array(board.dots) - unseen
+        text = (
+            f"{across_seen} x {down_seen} of the board's {across} x {down} columns and rows were found: where its "
+            f"middle lies is a guess, by its tilt {written(off_mm, 2)} mm in depth"
+        )
         remedy = "correct board.dots, or bring all of the board into view"
         yield Notice("board-incomplete", "board.dots", text, remedy, float(found), f"{across * down}")
     if found < ENOUGH_POINTS:
@@ -160,7 +167,7 @@ def board_notices(pose: BoardPose, board: BoardGeometry, camera: Camera, media: 
         remedy = "correct what is off of board.spacing_mm, board.medium and main_lens.magnification"
         expected += f" within {MAGNIFICATION_TOLERANCE:.0%}"
         yield Notice("magnification", "board.spacing_mm", text, remedy, shown, expected)
-    depth, largest = field_depth(pose, camera), LARGEST_FIELD_DEPTH * lens_in_scene_mm(camera)[1]
+    depth, largest = field_depth(pose, camera), LARGEST_FIELD_DEPTH * depth_unit
     if depth is not None and depth.beyond(largest):
         text = (
             f"a flat board seems {written(abs(depth.value))} mm {'further' if depth.value > 0.0 else 'nearer'} in the "
