@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from scipy.ndimage import gaussian_filter
 from lfpiv_cli.arrays import Floats
 from lfpiv_cli.calibration import light_checks
 from lfpiv_cli.calibration.lattice import lattice_through
-from lfpiv_cli.calibration.lens_light import Cells, LensImages, folded
+from lfpiv_cli.calibration.lens_light import Beside, Cells, LensImages, Place, folded
 from lfpiv_cli.calibration.light_checks import blur_notices, dark_notices, level_notices, uniform_notices
 from lfpiv_cli.calibration.rectification import Rectification
 from lfpiv_cli.calibration.sheet import sheet_fit
@@ -89,6 +90,14 @@ def test_shift_is_found_so_well(images: LensImages, lattice: Lattice, shift: tup
         assert place.sigma_px < 0.08
         assert np.hypot(*(place.shift_px - shift)) < max(5.0 * place.sigma_px, 0.05)
     assert codes(images, tracers(lattice, shift, tilt=tilt)) == (["lens-images-moved"] if any(shift) else [])
+
+
+@pytest.mark.parametrize(("shift_px", "moved"), [(0.2, False), (0.25, True), (0.14, False)])
+def test_a_shift_is_told_that_is_certainly_harmful(lattice: Lattice, shift_px: float, moved: bool) -> None:
+    place = Place(np.array([0.0, shift_px]), 0.04)
+    known = Mock(lattice_px=lattice, beside=lambda _: Beside((place,), 1.0, 0.01, True))
+    reported = light_checks.position_notices(known, np.zeros(SHAPE), "board", "")
+    assert [each.code for each in reported] == (["lens-images-moved"] if moved else [])
 
 
 @pytest.mark.thorough

@@ -9,7 +9,7 @@ import pytest
 import yaml
 
 import lfpiv_cli as lf
-from lfpiv_cli.calibration.board_pose import BoardGeometry, pose_of_dots
+from lfpiv_cli.calibration.board_pose import BoardGeometry, BoardPose, pose_of_dots
 from lfpiv_cli.calibration.lattice import fit_lattice
 from lfpiv_cli.calibration.lens_light import LensImages
 from lfpiv_cli.calibration.light_checks import Shapes, field_depth, shape_notices, shapes_of
@@ -159,7 +159,7 @@ def test_a_board_tells_of_a_curved_field(small: Camera, rng: np.random.Generator
     x, y = np.stack(np.meshgrid(0.3 * np.arange(-2.0, 3.0), 0.3 * np.arange(-2.0, 3.0)), axis=-1).reshape(-1, 2).T
     corner2 = float(np.sum((0.5 * small.pixel_mm * np.array([small.columns, small.rows])) ** 2))
 
-    def pose_with(depth_mm: float) -> object:
+    def pose_with(depth_mm: float) -> BoardPose:
         z = 0.1 * x + depth_mm * (x**2 + y**2) / corner2 + rng.normal(0.0, 1e-3, x.size)
         dots = np.column_stack([x + 0.02, y - 0.01, z])
         sigma = np.full((x.size, 3), 1e-3)
@@ -171,6 +171,13 @@ def test_a_board_tells_of_a_curved_field(small: Camera, rng: np.random.Generator
     assert found.value == pytest.approx(0.1, abs=5.0 * found.sigma)
     reported = [[each.code for each in board_notices(pose, board, small, Media())] for pose in (curved, flat)]
     assert ["field-curved" in codes for codes in reported] == [True, False]
+    # Dots that do not scatter still tell of corners that are far from them by what they may have in common.
+    names = ("indices", "dots_mm", "dots_sigma_mm", "residual_mm", "dots_px")
+    near = np.flatnonzero(np.maximum(np.abs(x), np.abs(y)) < 0.4)
+    even = replace(flat, residual_mm=np.zeros_like(flat.residual_mm))
+    middle = replace(even, **{name: getattr(even, name)[near] for name in names})
+    wide, narrow = (field_depth(pose, small).sigma for pose in (even, middle))
+    assert narrow > 4.0 * wide > 0.0
 
 
 @pytest.mark.parametrize(("strengths", "refused"), [({"falloff": 0.3}, False), ({"astigmatism_mm": 0.1}, True)])

@@ -17,7 +17,7 @@ from scipy.ndimage import uniform_filter
 from scipy.spatial import KDTree
 
 from lfpiv_cli.arrays import Flags, Floats
-from lfpiv_cli.calibration.board_pose import COMMON_SHARE_OF_LENS_DEPTH, BoardPose
+from lfpiv_cli.calibration.board_pose import COMMON_SHARE_OF_LENS_DEPTH, BoardPose, lens_in_scene_mm
 from lfpiv_cli.calibration.lattice import LatticeFit
 from lfpiv_cli.calibration.lens_light import LensImages, cell_places, part_middles
 from lfpiv_cli.calibration.white import MIDDLE_PER_PITCH, NARROWEST_LENS_IMAGE
@@ -136,14 +136,20 @@ def field_depth(pose: BoardPose, camera: Camera) -> Fitted | None:
     corner = 0.5 * camera.pixel_mm * float(np.hypot(camera.columns, camera.rows))
     height = camera.px_to_mm(pose.dots_px) / corner
     terms = np.column_stack([np.ones(len(height)), height, np.sum(height**2, axis=1)])
-    return _fit(terms, pose.residual_mm[:, 2])[3]
+    # From few dots in the middle the corners are far away, and what dots have in common may change up to there.
+    common_mm = COMMON_SHARE_OF_LENS_DEPTH * lens_in_scene_mm(camera)[1]
+    return _fit(terms, pose.residual_mm[:, 2], common_mm)[3]
 
 
-def _fit(terms: Floats, values: Floats) -> list[Fitted]:
-    """Return the coefficients (k,) of terms (n, k) that fit values (n,) best, and standard errors by the scatter."""
+def _fit(terms: Floats, values: Floats, least: float = 0.0) -> list[Fitted]:
+    """Return the coefficients (k,) of terms (n, k) that fit values (n,) best, and standard errors by the scatter.
+
+    Values err by `least` at least, however little few of them scatter.
+    """
     found = np.linalg.lstsq(terms, values, rcond=None)[0]
     freedom = max(1, len(values) - terms.shape[1])
-    variance = np.sum((values - terms @ found) ** 2) / freedom * np.diag(np.linalg.pinv(terms.T @ terms))
+    scatter = float(np.sum((values - terms @ found) ** 2)) / freedom
+    variance = max(scatter, least**2) * np.diag(np.linalg.pinv(terms.T @ terms))
     return [Fitted(float(value), float(np.sqrt(square))) for value, square in zip(found, variance, strict=True)]
 
 
@@ -294,6 +300,8 @@ LARGEST_SHIFT_SHARE, LARGEST_SHIFT_PX = 0.008, 0.15
 LARGEST_BLUR_PX, DIFFRACTED, GREEN_MM = 0.6, 0.45, 5.5e-4
 # In so many standard errors, of as many places and pictures as people have.
 CERTAIN_SIGMAS = 5.0
+# What has moved has moved by more than does no harm where it is this many standard errors beyond.
+HARMFUL_SIGMAS = 2.0
 # Of a picture's light at least so much follows the lens images: haze, tracers and boards do wholly, hot pixels do not.
 LEAST_FOLLOWING = 0.7
 # Where less than this follows for certain, what seems to have moved may be chance.
@@ -334,7 +342,11 @@ def position_notices(images: LensImages, picture: NDArray[np.floating], name: st
         return [Notice("light-off-lens-images", name, text, other, following, f"at least {LEAST_FOLLOWING:g}")]
     largest = max(LARGEST_SHIFT_SHARE * float(images.lattice_px.pitch.mean()), LARGEST_SHIFT_PX)
     sizes = [(float(np.hypot(*place.shift_px)), place) for place in found.places]
-    certain = [each for each in sizes if each[0] > max(largest, CERTAIN_SIGMAS * each[1].sigma_px)]
+    certain = [
+        (size, place)
+        for size, place in sizes
+        if size > max(largest + HARMFUL_SIGMAS * place.sigma_px, CERTAIN_SIGMAS * place.sigma_px)
+    ]
     if not certain or following - spread <= LEAST_CERTAIN_FOLLOWING:
         return []
     size, place = max(certain, key=lambda each: each[0])

@@ -290,8 +290,11 @@ def points_of(bench: Bench, frame: Frame, found: Particles, size: TracerSize, pr
     left, haze = what_is_left(frame, found), frame.haze
     norm = root_of_squares(np.where(frame.unusable, 0.0, frame.light))
     share_left = root_of_squares(left) / norm if norm > 0.0 else 0.0
-    # Of four tracers for each microlens only 1.3 are found, and few of them are right.
-    number = tracers_per_lens(bench, frame) if share_left > MUCH_LEFT else None
+    left_rms = float(np.sqrt(np.mean(left[~frame.unusable] ** 2)))
+    noise = found.noise.of_dark(None if haze is None else haze.image[~frame.unusable].astype(np.float64))
+    # Of four tracers for each microlens only 1.3 are found, and few of them are right. What noise leaves is no light.
+    crowded = share_left**2 * max(left_rms**2 - noise**2, 0.0) > (MUCH_LEFT * left_rms) ** 2
+    number = tracers_per_lens(bench, frame) if crowded else None
     focus = _focal_length(bench, frame, found)
     return Points(
         content.reference.points_from_focal_point(found.position_mm),
@@ -312,11 +315,9 @@ def points_of(bench: Bench, frame: Frame, found: Particles, size: TracerSize, pr
             "residual": share_left,
             "residual_lit": found.left,
             "residual_alike": found.alike,
-            "residual_rms_counts": float(np.sqrt(np.mean(left[~frame.unusable] ** 2))),
+            "residual_rms_counts": left_rms,
             "excluded_pixels": int(np.count_nonzero(frame.unusable)),
-            "read_noise_counts": found.noise.of_dark(
-                None if haze is None else haze.image[~frame.unusable].astype(np.float64)
-            ),
+            "read_noise_counts": noise,
             "particles_per_lens": float(np.count_nonzero(inside)) / lenses,
             "depth_ambiguous": float(np.mean(found.ambiguous[inside])) if inside.any() else 0.0,
             "beyond_depths": float(np.mean(found.beyond)) if inside.size else 0.0,
