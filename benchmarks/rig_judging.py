@@ -37,6 +37,9 @@ BRIGHT = 20.0
 # Beyond so many standard errors of the bound it is another tracer, or another depth that explains the light as well.
 ASTRAY = 10.0
 AXES = "xyz"
+# Stated errors are too small where fewer errors lie within 1.96 of them; light is not what the model says where errors
+# are so many times what light allows.
+SMALLEST_COVERAGE, BEYOND_LIGHT = 0.8, 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,6 +62,20 @@ class Truth:
     bound: Bound
     light_over_sigma: NDArray[np.float64]
     flow: Flow
+
+
+def true_warnings(figures: Figures) -> set[str]:
+    """Return the codes of warnings that are true by the figures, of results that are no worse than is allowed.
+
+    That an image shows no tracers, where none lies in the volume; and that light is another than the model's and stated
+    errors may be too small, where errors are beyond both in some direction, of fewer tracers than coverage is asked of.
+    """
+    true = {"frame-uniform"} if figures.get("tracers") == 0.0 else set()
+    for axis in AXES:
+        uncovered = figures.get(f"coverage_{axis}", 1.0) < SMALLEST_COVERAGE
+        if uncovered and figures.get(f"over_{axis}", 1.0) > BEYOND_LIGHT:
+            true.add("light-model")
+    return true
 
 
 def judge_calibration(rig: DrawnRig, calibration: Path) -> Figures:

@@ -279,6 +279,14 @@ def test_verdicts_and_their_summary() -> None:
     assert "2 worked with nothing wrong: 1 warned" in summary([alarm, replace(hazy, number=2, hard=("haze",))])
     assert "warned although right: rig 1: wrong-links" in summary([alarm])
     assert "there is no room" in text
+    # What is warned of that is true of the input is no false alarm.
+    few, off = {"tracers": 3.0, "recall": 1.0, "bright": 1.0}, {"coverage_x": 0.67, "over_x": 5.5}
+    odd = Step("reconstruct particles", 0, "", ["lfpiv: left [light-model]", "lfpiv: even [frame-uniform]"], 1.0)
+    for figures, alarms in ((few, "frame-uniform, light-model"), (few | off, "frame-uniform"), (off, "frame-uniform")):
+        assert f"warned although right: rig 1: {alarms}\n" in summary([outcome_of(figures, odd)]) + "\n"
+    for change in ({"over_x": 2.0}, {"coverage_x": 0.9}):
+        assert "light-model" in summary([outcome_of(few | off | change, odd)])
+    assert "1 worked with nothing wrong: 0 warned" in summary([outcome_of(off | {"tracers": 0.0}, odd)])
 
 
 def test_rigs_in_a_file_are_not_run_again(
