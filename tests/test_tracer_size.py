@@ -121,6 +121,16 @@ def test_sizes_of_frames_are_pooled_and_a_point_has_a_limit() -> None:
     assert 0.1 < point.lenses + 3.0 * point.sigma_lenses < 0.25
 
 
+def test_squares_that_scatter_less_than_they_err_are_of_one_thing(rng: np.random.Generator) -> None:
+    alike, independent = (diameter_of([Sizes(rng.normal(1.7, s, 36), np.full(36, 0.6))]) for s in (0.08, 0.6))
+    assert alike is not None
+    assert independent is not None
+    assert independent.sigma_lenses == pytest.approx(0.125 / 2.0 / 1.3, rel=0.5)
+    # Down to nothing by three of them.
+    assert alike.sigma_lenses == pytest.approx(1.3 / 3.0, rel=0.1)
+    assert not alike.resolved
+
+
 @pytest.mark.thorough
 def test_a_view_of_other_balls_is_that_made_for_them(table2: Camera, water: Media) -> None:
     for layout in ("square", "hexagonal"):
