@@ -14,10 +14,10 @@ from lfpiv_cli.files.weights_file import WeightsFile
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media
 from lfpiv_cli.particles import search
+from lfpiv_cli.particles.camera_light import FocalLength, focal_length_of
 from lfpiv_cli.particles.fitting import add_all, refine
 from lfpiv_cli.particles.joining import with_twins_joined
 from lfpiv_cli.particles.least_squares import SMALLEST_GAIN, observation_of
-from lfpiv_cli.particles.microlens_focus import FocalLength, focal_length_of
 from lfpiv_cli.particles.search import State, Task, blank, noise_with, observed, rebuilt
 from lfpiv_cli.particles.view import View, raw_view
 from lfpiv_cli.verbs.frames import Bench, bench_of, frame_notices

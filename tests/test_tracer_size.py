@@ -12,8 +12,8 @@ from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.camera import Camera, Lattice
 from lfpiv_cli.optics.line_responses import USUAL_DIFFUSION_PX
 from lfpiv_cli.optics.media import Media
+from lfpiv_cli.particles.camera_light import MODEL_SHARE, MODEL_SQUARES, Forms, forms_of, together_of
 from lfpiv_cli.particles.diameter import NO_SIZES, Diameter, Sizes, Trial, _settled_sizes, diameter_by, diameter_of
-from lfpiv_cli.particles.diffusion import MODEL_SHARE, MODEL_SQUARES, Forms, forms_of, together_of
 from lfpiv_cli.particles.search import Task
 from lfpiv_cli.particles.view import Light, raw_view, with_radius
 from lfpiv_cli.verbs.tracers import Diffusion, TracerSize, size_notices

@@ -10,7 +10,7 @@ Tracers that overlap others which were not found look larger than they are. So o
 all that is left, as it is around one that stands alone; an image that has too few of them shows no size, nor does one
 that half or twice the size explains as well.
 
-By waves charge diffusion is measured along with it, see `diffusion`.
+By waves charge diffusion is measured along with it, see `camera_light`.
 
 Axes: see `search`. Diameters in this module are in microlenses as the scene shows them.
 """
@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lfpiv_cli.kernels import njit
-from lfpiv_cli.particles.diffusion import NO_FORMS, Forms, Together, forms_of, together_of
+from lfpiv_cli.particles.camera_light import NO_FORMS, Forms, Together, forms_of, together_of
 from lfpiv_cli.particles.fitting import NO_FURTHER, Choice, Fitter, begin_at, fitter_of, judge
 from lfpiv_cli.particles.least_squares import (
     SMALLEST_GAIN,
@@ -60,7 +60,7 @@ from lfpiv_cli.particles.search import (
 )
 from lfpiv_cli.particles.view import by_waves, footprint_radius_mm, on_array_mm, over_tiles, with_radius
 from lfpiv_cli.reconstruction.solvers import normalisers
-from lfpiv_cli.robust import MAD_TO_SIGMA, of_half_the_sum
+from lfpiv_cli.robust import of_half_the_sum, weighted_median
 
 # Sizes that are tried first, in microlenses: each about twice the one before, from what no camera resolves on.
 FIRST_DIAMETERS = (0.06, 0.12, 0.25, 0.5, 0.9, 1.5, 2.4, 3.8)
@@ -107,11 +107,6 @@ NOISE_ALONE = 3.0
 # microlenses^2; and how often they are tried anew about a better one.
 DIFFUSION_STEP, SQUARE_STEPS, TRIALS = 0.035, (0.15, 0.01), 4
 NINE = np.array([(a, b) for a in (-1.0, 0.0, 1.0) for b in (-1.0, 0.0, 1.0)])
-# Standard error of a median over that of a mean.
-MEDIAN_TO_MEAN = 1.25
-# Squares whose scatter is a smaller share of their stated errors do not err independently: in faint haze 35 peaks of it
-# agreed on a diameter to a seventh of these, 20 standard errors from that of the other image's tracers.
-LEAST_SCATTER = 0.5
 
 
 class Sizes(NamedTuple):
@@ -200,7 +195,7 @@ def diameter_of(frames: Sequence[Sizes]) -> Diameter | None:
     square = np.concatenate([sizes.square for sizes in frames]) if frames else np.zeros(0)
     if not square.size:
         return None
-    middle, error = middle_of(Sizes(square, np.concatenate([sizes.sigma for sizes in frames])))
+    middle, error = weighted_median(square, np.concatenate([sizes.sigma for sizes in frames]))
     diameter = float(np.sqrt(max(middle, 0.0)))
     # From squares to diameters, also where the diameter is 0: how far up or down the square may be.
     ends = np.sqrt(np.maximum(max(middle, 0.0) + LIMIT_SIGMAS * error * np.array([-1.0, 1.0]), 0.0))
@@ -404,20 +399,6 @@ def _common(diameters: NDArray[np.float64], losses: NDArray[np.float64]) -> floa
     if not losses.size:
         return float(diameters[len(diameters) // 2])
     return float(diameters[np.argmin(np.sum(np.log1p(losses), axis=1))])
-
-
-def middle_of(sizes: Sizes) -> tuple[float, float]:
-    """Return a weighted median and its standard error, from the scatter or from what each one states."""
-    scatter = MAD_TO_SIGMA * float(np.median(np.abs(sizes.square - np.median(sizes.square))))
-    weight = 1.0 / (sizes.sigma**2 + scatter**2)
-    order = np.argsort(sizes.square, kind="stable")
-    below = np.cumsum(weight[order]) - 0.5 * weight[order]
-    middle = float(np.interp(0.5 * weight.sum(), below, sizes.square[order]))
-    scattered = MEDIAN_TO_MEAN * scatter / np.sqrt(sizes.square.size)
-    # Independent errors scatter as they are stated; those that scatter less are of one thing, and as many do not help.
-    each = 1.0 / np.sqrt(np.mean(1.0 / sizes.sigma**2))
-    common = scatter < LEAST_SCATTER * each
-    return middle, float(max(scattered, each if common else each / np.sqrt(sizes.square.size)))
 
 
 def _of_diameter(task: Task, diameter: float, diffusion_px: float | None = None) -> Task:

@@ -240,7 +240,7 @@ class Bench:
     excluded : pixels in the weights' frame that never take part: off the sensor, or touched by `lasting`
     sums : of the weights without `excluded`; None where weights are made for each image
     lens_images : what the light of frames is held against
-    light_covariance : of the tracers' size and of diffusion, see `particles.diffusion`; None: not measured
+    light_covariance : of the tracers' size and of diffusion, see `particles.camera_light`; None: not measured
     """
 
     content: WeightsFile

@@ -26,9 +26,9 @@ from lfpiv_cli.files.weights_file import WeightsFile, open_weights
 from lfpiv_cli.notice import Notice, warn_of
 from lfpiv_cli.optics.curved_space import CurvedSpace
 from lfpiv_cli.optics.tracing import ObjectSpace
+from lfpiv_cli.particles.camera_light import FocalLength, focal_length_of
 from lfpiv_cli.particles.counting import tracers_per_lens as counted
 from lfpiv_cli.particles.diameter import ENOUGH, UNKNOWN_LENSES, diameter_by
-from lfpiv_cli.particles.microlens_focus import FocalLength, focal_length_of
 from lfpiv_cli.particles.neighbour_frames import second_frame, second_pass
 from lfpiv_cli.particles.rounds import ROUNDS, first_pass
 from lfpiv_cli.particles.search import LAST_UNEXPLAINED, MARGIN_DEPTHS, MUCH_LEFT, Particles, Task, result, task_of

@@ -11,8 +11,8 @@ from lfpiv_cli.files.config import Config
 from lfpiv_cli.files.particle_file import Points
 from lfpiv_cli.notice import Notice, written
 from lfpiv_cli.optics.line_responses import USUAL_DIFFUSION_PX
+from lfpiv_cli.particles.camera_light import USUAL_SIGMA_PX
 from lfpiv_cli.particles.diameter import LIMIT_SIGMAS, UNKNOWN_LENSES, Diameter
-from lfpiv_cli.particles.diffusion import USUAL_SIGMA_PX
 from lfpiv_cli.particles.search import MUCH_ALIKE, MUCH_LEFT
 from lfpiv_cli.verbs.frames import haze_notices
 

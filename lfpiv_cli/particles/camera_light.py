@@ -1,14 +1,21 @@
-"""The tracers' size and the sensor's charge diffusion together, by maximum likelihood, where light goes by waves.
+"""What the images of tracers show of the camera: how far charge diffuses, and how far its microlenses are from focus.
 
-Either blurs an image by its square: a size as far as it is seen magnified, diffusion by the same wherever light falls.
-What each tracer loses in chi-squared with other squares q = (diameter^2, diffusion^2) is nearly a quadratic form,
+Diffusion, where light goes by waves, together with the tracers' size, by maximum likelihood. Either blurs an image by
+its square: a size as far as it is seen magnified, diffusion by the same wherever light falls. What each tracer loses in
+chi-squared with other squares q = (diameter^2, diffusion^2) is nearly a quadratic form,
 
     q^T M q - 2 b^T q,
 
 and that of all tracers is their sum, together with what is known of diffusion before an image is looked at. Tracers
 that are two, or of another size, contradict the others by more than chance, and count for less the more they do.
 
-Units: microlenses as the scene shows them, and pixels.
+The microlenses' focal length: the main lens's light converges before or behind the array, and each microlens that it
+lights shows a patch of it on the sensor. With another focal length patches become wider on one side of the focal plane
+and narrower on the other. Nothing else does that: diffraction, diffusion and a tracer's size widen them on both, and a
+white image, whose light comes evenly from everywhere, hardly changes. Each particle shows by how much, in one
+Gauss-Newton step with its own place and light free, the others being as found.
+
+Units: microlenses as the scene shows them, and pixels. Axes: image axes, mm; see `fitting`.
 
 References
 ----------
@@ -24,7 +31,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.optics.line_responses import USUAL_DIFFUSION_PX
+from lfpiv_cli.particles.least_squares import UNKNOWNS, lit_by, respond_all, room_for
+from lfpiv_cli.particles.view import View, entry_capacity
+from lfpiv_cli.robust import weighted_median
 
 # How far charge diffuses in a sensor may differ from what is usual.
 USUAL_SIGMA_PX = 0.1
@@ -44,6 +55,12 @@ MODEL_SHARE, MODEL_SQUARES = 0.01, (0.005, 0.006)
 # From so many tracers found for each microlens on, what neighbours that were not found add to it grows with their
 # number's square: in an image of 2 for each microlens, diffusion of .3 px seemed .19.
 CROWDED = 0.8
+# So many particles tell it to a thousandth: those nearest to the optical axis, where lenses are at their best.
+MOST_PARTICLES = 100
+# With fewer their scatter is not known.
+FEWEST_PARTICLES = 10
+# Difference of the focal length, a share of it: patches change by less than a fifth of a pixel.
+STEP = 0.01
 
 
 class Forms(NamedTuple):
@@ -146,3 +163,64 @@ def _lowest(matrix: NDArray[np.float64], right: NDArray[np.float64]) -> NDArray[
 def _of_root(root: float, error: float) -> float:
     """Return the standard error of a root by that of its square, also where the root is 0."""
     return float(np.sqrt(root**2 + error) - root)
+
+
+class FocalLength(NamedTuple):
+    """By how much the microlenses' focal length is off what is said, a share of it, and the standard error."""
+
+    off: float
+    sigma: float
+
+
+def focal_length_of(view: View, particles: Floats, residual: Floats, weight: Floats) -> FocalLength | None:
+    """Return what particles (n, 4) tell of the focal length; None where too few do.
+
+    Parameters
+    ----------
+    view : by rays; where the particles were found by waves they tell half of what is off
+    residual, weight : (pixels,) what all particles leave of the image, and the inverse variances
+    """
+    if len(particles) < FEWEST_PARTICLES:
+        return None
+    camera, length = view.camera, (1.0 + STEP) * view.camera.microlens_focal_length_mm
+    bend = 1.0 - camera.microlens_distance_mm / length
+    views = (view, view._replace(camera=camera._replace(microlens_focal_length_mm=length, bend=bend)))
+    depth = particles[:, 2]
+    room = max(entry_capacity(each, depth.min(), depth.max()) for each in views)
+    nearest = np.argsort(np.hypot(particles[:, 0], particles[:, 1]), kind="stable")[:MOST_PARTICLES]
+    steps = [_step(views, particle, residual, weight, room) for particle in particles[nearest]]
+    found = np.array([step for step in steps if step is not None]).reshape(-1, 2)
+    if len(found) < FEWEST_PARTICLES:
+        return None
+    middle, error = weighted_median(*(STEP * found.T))
+    return FocalLength(middle, error)
+
+
+def _step(
+    views: tuple[View, View], particle: Floats, residual: Floats, weight: Floats, room: int
+) -> tuple[float, float] | None:
+    """Return the step from the first view that a particle (4,) tells, and its standard error.
+
+    In differences of the other one; None where it tells nothing.
+    """
+    lit = []
+    for view in views:
+        responses = room_for(1, room, 0)
+        respond_all(view, particle[np.newaxis], responses)
+        own_pixels, values = lit_by(responses, 0)
+        lit.append((own_pixels, values[:UNKNOWNS, : own_pixels.size]))
+    pixels = np.unique(np.concatenate([each for each, _ in lit]))
+    root = np.sqrt(weight[pixels])
+    # Light and its derivatives by x, y and z (4, pixels), summed where a pixel is named twice.
+    own, longer = (
+        np.stack([np.bincount(np.searchsorted(pixels, at), row, pixels.size) for row in values]) * root
+        for at, values in lit
+    )
+    kept = np.linalg.qr(own.T)[0]
+    design, rest = particle[3] * (longer[0] - own[0]), residual[pixels] * root
+    design, rest = (each - kept @ (kept.T @ each) for each in (design, rest))
+    information, freedom = float(np.sum(design**2)), np.count_nonzero(root) - UNKNOWNS - 1
+    if not information > 0.0 or freedom < 1:
+        return None
+    scatter = max(float(np.sum(rest**2)) / freedom, 1.0)
+    return float(np.sum(design * rest)) / information, float(np.sqrt(scatter / information))
