@@ -133,14 +133,18 @@ def test_ball_is_the_mean_of_its_points() -> None:
 
 
 @pytest.mark.thorough
-def test_oblique_rays_are_bent_more() -> None:
-    """Far from the axis Snell's law shows a point nearer than on it, and aside; the first derivatives tell how much."""
-    window = Window(185.0, 5.0)
-    exact = ObjectSpace(WATER, window, "exact")
+@pytest.mark.parametrize(
+    ("distance_mm", "point", "depth_mm"), [(185.0, (6.0, 0.03, 3.0), 0.002), (100.0, (2.47, 0.23, 2.8), 0.003)]
+)
+def test_oblique_rays_are_bent_more(distance_mm: float, point: tuple[float, ...], depth_mm: float) -> None:
+    """Far from the axis Snell's law shows a point nearer than on it, and aside; the first derivatives tell how much.
+
+    Behind 95 mm of water each place of the aperture shows it aside by another length.
+    """
+    exact = ObjectSpace(WATER, Window(distance_mm, 5.0), "exact")
     camera = replace(camera_of(), columns=2400)
-    point = np.array([6.0, 0.03, 3.0])
     view = raw_view(camera, WATER, 0.0, None, exact, Light(GREEN_MM, DIFFUSION_PX, (2.5, 3.5)))
-    patch = WavesInCamera(replace(camera, diffusion_px=DIFFUSION_PX), exact, Waves(GREEN_MM)).patch(point)
+    patch = WavesInCamera(replace(camera, diffusion_px=DIFFUSION_PX), exact, Waves(GREEN_MM)).patch(np.array(point))
     whole = np.zeros((PIXELS, 2400))
     assert patch is not None
     patch.add_to(whole, 1.0)
@@ -151,8 +155,8 @@ def test_oblique_rays_are_bent_more() -> None:
     light[room.pixels[0, :count]], by_z[room.pixels[0, :count]] = room.values[0, [0, 3], :count]
     left = whole.ravel() - light
     weight = 1.0 / (1e-5 + whole.ravel())
-    # One step of a fit of depth alone: 0.007 mm without coma.
-    assert abs(np.sum(weight * by_z * left) / np.sum(weight * by_z**2)) < 0.002
+    # One step of a fit of depth alone: 0.007 mm without coma behind 1 cm of water.
+    assert abs(np.sum(weight * by_z * left) / np.sum(weight * by_z**2)) < depth_mm
     assert np.abs(left).sum() < 0.025
 
 

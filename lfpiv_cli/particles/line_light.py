@@ -18,7 +18,7 @@ from lfpiv_cli.kernels import COUNT_NO_REFERENCES, njit
 from lfpiv_cli.optics.line_responses import spline_slopes, spline_weights
 from lfpiv_cli.optics.tracing import slope_ratio
 from lfpiv_cli.particles.refraction import Bend, displaced
-from lfpiv_cli.particles.response import Along, Projection, lenses_of, project
+from lfpiv_cli.particles.response import Along, Projection, lenses_of, part_of_lens, project
 from lfpiv_cli.particles.view import View
 from lfpiv_cli.simd import LANES, ROWS, combine_rows
 
@@ -49,6 +49,24 @@ class Cell(NamedTuple):
     number: int
     place: float
     moved_mm: float
+
+
+class Oblique(NamedTuple):
+    """What Snell's law makes of a particle's rays beside the optical axis.
+
+    Attributes
+    ----------
+    z_x, z_y : depths at which a particle on the axis has rays that spread as this one's do along x, and along y
+    further_x, further_y : how much further its light lies on the array than that of its chief ray, mm
+    coma_x, coma_y : the same of rays through (X, Y) of the aperture, as (of its radius)^2: of X^2, Y^2 and X Y
+    """
+
+    z_x: float
+    z_y: float
+    further_x: float
+    further_y: float
+    coma_x: tuple[float, float, float]
+    coma_y: tuple[float, float, float]
 
 
 class Room(NamedTuple):
@@ -85,9 +103,9 @@ def respond_by_lines(view: View, bend: Bend, z: float, pixels: NDArray[np.int32]
         return 0
     # Lenses of a column, and of a row, have nearly the same place along one axis: that of the middle one.
     middle_i, middle_j = (low_i + high_i) // 2, (low_j + high_j) // 2
-    z_x, z_y, further_x, further_y = _oblique(view, bend, z)
-    of_columns = _responses(view, x, z_x, centres[middle_j, low_i : high_i + 1, 0] - further_x)
-    of_rows = _responses(view, y, z_y, centres[low_j : high_j + 1, middle_i, 1] - further_y)
+    oblique = _oblique(view, bend, z)
+    of_columns = _responses(view, x, oblique.z_x, centres[middle_j, low_i : high_i + 1, 0] - oblique.further_x)
+    of_rows = _responses(view, y, oblique.z_y, centres[low_j : high_j + 1, middle_i, 1] - oblique.further_y)
     reach_x, reach_y = _reach(view, x), _reach(view, y)
     room = _room_for(view)
     count = 0
@@ -104,31 +122,39 @@ def respond_by_lines(view: View, bend: Bend, z: float, pixels: NDArray[np.int32]
             of_y = _cell(view, (before, s_y, behind), y.pixels, centres[j, middle_i, 1] - s_y)
             if of_x.number > 0 and of_y.number > 0 and count + of_x.number * of_y.number <= pixels.size:
                 responses = of_columns[i - low_i], of_rows[j - low_j]
-                count += _write_lens(view, projection, (of_x, of_y), responses, room, pixels[count:], values[:, count:])
+                number = _write_lens(view, projection, (of_x, of_y), responses, room, pixels[count:], values[:, count:])
+                _add_coma(view, projection, oblique, (s_x, s_y), pixels[count : count + number], values[:, count:])
+                count += number
     return count
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
-def _oblique(view: View, bend: Bend, z: float) -> tuple[float, float, float, float]:
-    """Return at which depth a particle on the axis has rays that spread as this one's do, along x and along y.
+def _oblique(view: View, bend: Bend, z: float) -> Oblique:
+    """Return what bends rays beside the axis otherwise than on it: astigmatism and coma.
 
-    And how much further its light lies on the array than that of its chief ray, mm: astigmatism and coma of rays that
-    Snell's law bends more, 0.01 mm of depth and 0.0006 mm aside 6 mm beside the axis of Table 2's camera. They are
-    those of rays through opposite ends of the aperture; the mean of coma over it is half of that over its rim.
+    0.01 mm of depth and 0.0006 mm aside 6 mm beside the axis of Table 2's camera behind 1 cm of water. They are those
+    of rays through opposite ends of the aperture. Coma displaces light as the gradient of (X^2 + Y^2) (a X + b Y) does,
+    whose mean over the aperture is half of that over its rim.
     """
     if bend.nodes.size == 0:
-        return z, z, 0.0, 0.0
-    radius = view.camera.aperture_radius_mm
+        return Oblique(z, z, 0.0, 0.0, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    radius, half_far = view.camera.aperture_radius_mm, 0.5 * view.camera.image_distance_mm
     on_axis = slope_ratio(radius * radius, bend.nodes, bend.factors)
     right, left = displaced(bend, radius, 0.0), displaced(bend, -radius, 0.0)
     top, bottom = displaced(bend, 0.0, radius), displaced(bend, 0.0, -radius)
     per_slope = 1.0 / (view.depth_ratio * on_axis * on_axis)
     rise_x = 0.5 * (right[0] - left[0]) / radius + 1.0 / bend.distance_x - on_axis
     rise_y = 0.5 * (top[1] - bottom[1]) / radius + 1.0 / bend.distance_y - on_axis
-    share = 0.125 * view.camera.image_distance_mm
-    further_x = share * (right[0] + left[0] + top[0] + bottom[0])
-    further_y = share * (right[1] + left[1] + top[1] + bottom[1])
-    return z - rise_x * per_slope, z - rise_y * per_slope, further_x, further_y
+    along_x, across_x = half_far * (right[0] + left[0]), half_far * (top[0] + bottom[0])
+    across_y, along_y = half_far * (right[1] + left[1]), half_far * (top[1] + bottom[1])
+    return Oblique(
+        z - rise_x * per_slope,
+        z - rise_y * per_slope,
+        0.25 * (along_x + across_x),
+        0.25 * (along_y + across_y),
+        (along_x, across_x, 2.0 * across_y),
+        (across_y, along_y, 2.0 * across_x),
+    )
 
 
 @njit(cache=True)
@@ -304,3 +330,44 @@ def _write_lens(
             values[3, at + n] = by_z[n] + drift_x * by_x[n] + drift_y * by_y[n]
         at += number
     return count
+
+
+@njit(cache=True, **COUNT_NO_REFERENCES)
+def _add_coma(
+    view: View,
+    projection: Projection,
+    oblique: Oblique,
+    lens_mm: tuple[float, float],
+    pixels: NDArray[np.int32],
+    values: NDArray[np.float64],
+) -> None:
+    """Add what coma moves of a lens's light, to first order.
+
+    A pixel sees one place of the aperture, as far as rays from there meet the lens. But what depends on where light is
+    comes through the lens's edges, which diffract that of all places that the lens sees: the more of the aperture these
+    are, the less a pixel's light moves as its own place's, down to half of it (by images of waves).
+    """
+    (x_xx, x_yy, x_xy), (y_xx, y_yy, y_xy) = oblique.coma_x, oblique.coma_y
+    if x_xx == 0.0 and y_yy == 0.0:
+        return
+    camera, x, y, (s_x, s_y) = view.camera, projection.x, projection.y, lens_mm
+    radius = camera.aperture_radius_mm
+    low_x, high_x = part_of_lens(x.stretch * x.alpha, x.at - s_x, x.half, radius)
+    low_y, high_y = part_of_lens(y.stretch * y.alpha, y.at - s_y, y.half, radius)
+    own = 1.0 - 0.125 * (max(high_x - low_x, 0.0) + max(high_y - low_y, 0.0)) / radius
+    shift_x = (1.0 - camera.bend) * s_x - x.lever * x.beta * x.x
+    shift_y = (1.0 - camera.bend) * s_y - y.lever * y.beta * y.x
+    # From derivatives by x and y to those by the place on the array.
+    per_x, per_y, per_radius = -own / x.beta, -own / y.beta, 1.0 / radius
+    for n in range(pixels.size):
+        row, column = pixels[n] // camera.columns, pixels[n] % camera.columns
+        at_x = ((column + 0.5 - 0.5 * camera.columns) * camera.pixel_mm - shift_x) / x.scale
+        at_y = ((row + 0.5 - 0.5 * camera.rows) * camera.pixel_mm - shift_y) / y.scale
+        at_x, at_y = min(max(at_x, low_x), high_x) * per_radius, min(max(at_y, low_y), high_y) * per_radius
+        # What diffraction spreads beyond the aperture's image is of its rim.
+        within = 1.0 / max(np.sqrt(at_x * at_x + at_y * at_y), 1.0)
+        at_x, at_y = within * at_x, within * at_y
+        further_x = at_x * (x_xx * at_x + x_xy * at_y) + x_yy * at_y * at_y - oblique.further_x
+        further_y = at_x * (y_xx * at_x + y_xy * at_y) + y_yy * at_y * at_y - oblique.further_y
+        moved = further_x * per_x * values[1, n] + further_y * per_y * values[2, n]
+        values[0, n] = max(values[0, n] + moved, 0.0)

@@ -156,13 +156,13 @@ def bent_at(view: View, projection: Projection, bend: Bend, s_x: float, s_y: flo
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
 def _middle_of_part(gain: float, offset: float, reach: float, radius: float) -> float:
-    """Return the middle of `_part_of_lens`; where there is none, a place on the main lens all the same."""
-    low, high = _part_of_lens(gain, offset, reach, radius)
+    """Return the middle of `part_of_lens`; where there is none, a place on the main lens all the same."""
+    low, high = part_of_lens(gain, offset, reach, radius)
     return min(max(0.5 * (low + high), -radius), radius)
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
-def _part_of_lens(gain: float, offset: float, reach: float, radius: float) -> tuple[float, float]:
+def part_of_lens(gain: float, offset: float, reach: float, radius: float) -> tuple[float, float]:
     """Return between which X of -radius to radius `offset` + `gain` X is within `reach` of 0.
 
     The first is not below the second where it nowhere is.
@@ -207,7 +207,7 @@ def lit_pixels(
     sensor at `scale` X + `shift`.
     """
     camera = view.camera
-    low, high = _part_of_lens(gain, offset, reach, camera.aperture_radius_mm)
+    low, high = part_of_lens(gain, offset, reach, camera.aperture_radius_mm)
     if low >= high:
         return 0, 0
     one, other = scale * low + shift, scale * high + shift
