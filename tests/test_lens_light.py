@@ -11,7 +11,7 @@ from scipy.ndimage import gaussian_filter
 from lfpiv_cli.arrays import Floats
 from lfpiv_cli.calibration import light_checks
 from lfpiv_cli.calibration.lattice import lattice_through
-from lfpiv_cli.calibration.lens_light import Beside, Cells, LensImages, Place, folded
+from lfpiv_cli.calibration.lens_light import Beside, Cells, LensImages, Place, dark_level, folded, level_error
 from lfpiv_cli.calibration.light_checks import blur_notices, dark_notices, level_notices, uniform_notices
 from lfpiv_cli.calibration.rectification import Rectification
 from lfpiv_cli.calibration.sheet import sheet_fit
@@ -193,3 +193,8 @@ def test_blur_of_a_white_image_is_told(images: LensImages, lattice: Lattice, tab
         if notices:
             # Less what diffraction and charge are allowed, which these discs have not.
             assert blur_px - 0.4 < float(notices[0].measured) < blur_px + 0.1
+
+
+def test_the_error_of_a_dark_level_is_that_of_its_scatter(rng: np.random.Generator) -> None:
+    levels = [dark_level(rng.normal(100.0, 10.0, 222))[0] for _ in range(300)]
+    assert np.std(levels) == pytest.approx(level_error(10.0, 222), rel=0.15)

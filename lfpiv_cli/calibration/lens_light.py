@@ -38,6 +38,8 @@ LIGHT_SIGMAS = 3.0
 # Of a normal distribution these percentiles lie one and two standard deviations below its middle. So many pixels tell
 # them to a per cent.
 ONE_BELOW, TWO_BELOW, ENOUGH = 15.87, 2.275, 60_000
+# Standard error of the level that these percentiles tell, in the noise of one pixel over the root of their number.
+LEVEL_ERROR = 3.3
 # Multiples of the golden section lie evenly between whole numbers, however many.
 GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)
 # Of noise alone this share of a standard deviation stands above three of them, on average; light is ten times of it.
@@ -248,6 +250,11 @@ def dark_level(pixels: NDArray[np.floating]) -> tuple[float, float]:
     rounded = step * ((GOLDEN * np.arange(known.size)) % 1.0 - 0.5)
     two, one = np.percentile(known + rounded, [TWO_BELOW, ONE_BELOW])
     return float(2.0 * one - two), float(one - two)
+
+
+def level_error(noise: float, pixels: int) -> float:
+    """Return the standard error of the level that `dark_level` tells by so many pixels of normal noise."""
+    return LEVEL_ERROR * noise / float(np.sqrt(max(pixels, 1)))
 
 
 def folded(picture: NDArray[np.floating], level: float, cells: Cells, bins: int) -> Floats:

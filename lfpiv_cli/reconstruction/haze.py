@@ -54,6 +54,8 @@ MUCH_DARK, LEAST_SIGMAS_OF_DARK = 0.15, 0.4
 LEAST_COUNTS = 1.0
 # Rounding hides so much of the level between lens images, above which haze is (standard error).
 ROUNDING_COUNTS = 0.29
+# Where few pixels lie between lens images haze may be their level's error: it is above this many of it.
+CERTAIN_SIGMAS = 3.0
 # How far below it noise is looked at, and how far to either side texture.
 BELOW_SIGMAS, NEAR_SIGMAS = 4.0, 2.0
 # Share of the variance that pixels side by side have in common: of haze of 50 to 5,000 counts, with up to 0.65 tracers
@@ -145,7 +147,9 @@ class White:
         plateau = (light.ravel() > PLATEAU * usual[lenses.number]) & (light.ravel() > 0.0)
         return cls(light, lenses, np.ascontiguousarray(places.T[::-1], np.float32), plateau)
 
-    def haze_in(self, picture: Singles, usable: Flags, background: tuple[float, float]) -> tuple[Haze | None, float]:
+    def haze_in(
+        self, picture: Singles, usable: Flags, background: tuple[float, float], level_error: float = 0.0
+    ) -> tuple[Haze | None, float]:
         """Return the haze in a raw picture (rows, columns) less its dark image, and its standard error in counts.
 
         None where there is none for certain: what may be haze, and is too faint to take off, is an error. Where hardly
@@ -154,6 +158,7 @@ class White:
         Parameters
         ----------
         background : level and noise between the lens images, counts: haze is what is above
+        level_error : standard error of that level, counts
         """
         level, noise = background
         pixels = np.flatnonzero(usable.ravel() & self.plateau)
@@ -181,8 +186,9 @@ class White:
         # Noise alone is below the haze as often as above.
         dark = 2.0 * float(np.mean(rest < 0.0)) > MUCH_DARK
         told_by = 4.0 * np.pi * SMOOTH_LENSES**2 * float(np.median(count))
-        error = math.hypot(CORE_ERROR * sigma / math.sqrt(max(told_by, 1.0)), ROUNDING_COUNTS)
-        if middle <= max((LEAST_SIGMAS_OF_DARK if dark else LEAST_SIGMAS) * sigma, LEAST_COUNTS):
+        error = math.hypot(CORE_ERROR * sigma / math.sqrt(max(told_by, 1.0)), ROUNDING_COUNTS, level_error)
+        least = max((LEAST_SIGMAS_OF_DARK if dark else LEAST_SIGMAS) * sigma, LEAST_COUNTS)
+        if middle <= max(least, CERTAIN_SIGMAS * level_error):
             return None, math.hypot(middle, error) if dark else 0.0
         near = np.full(picture.shape, np.nan)
         near.ravel()[pixels] = np.where(np.abs(rest) < NEAR_SIGMAS * sigma, rest, np.nan)

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from lfpiv_cli.arrays import Floats, Singles
 from lfpiv_cli.calibration import light_checks
-from lfpiv_cli.calibration.lens_light import LensImages
+from lfpiv_cli.calibration.lens_light import LensImages, level_error
 from lfpiv_cli.calibration.rectification import Rectification
 from lfpiv_cli.calibration.sheet import sheet_fit
 from lfpiv_cli.errors import InputError, UsageError
@@ -279,7 +279,8 @@ class Bench:
         if dark.size > MOST_DARK * above.size and np.median(dark) < LEAST_SIGMAS * noise:
             return None, abs(float(np.median(dark)))
         white = white_of(calibration)
-        return (None, 0.0) if white is None else white.haze_in(lit, ~unusable, (level, noise))
+        known = level_error(noise, self.lens_images.between.size)
+        return (None, 0.0) if white is None else white.haze_in(lit, ~unusable, (level, noise), known)
 
     def sums_without(self, operator: Operator, excluded: Mask) -> Normalisers:
         """Return an operator's sums without what a frame excludes: from those that all frames share, if they do."""
