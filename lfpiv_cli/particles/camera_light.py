@@ -55,11 +55,11 @@ MODEL_SHARE, MODEL_SQUARES = 0.01, (0.005, 0.006)
 # From so many tracers found for each microlens on, what neighbours that were not found add to it grows with their
 # number's square: in an image of 2 for each microlens, diffusion of .3 px seemed .19.
 CROWDED = 0.8
-# So many particles tell it to a thousandth: those nearest to the optical axis, where lenses are at their best.
+# So many particles tell the focal length to a thousandth: those nearest to the axis, where lenses are at their best.
 MOST_PARTICLES = 100
 # With fewer their scatter is not known.
 FEWEST_PARTICLES = 10
-# Difference of the focal length, a share of it: patches change by less than a fifth of a pixel.
+# The difference that is tried, a share of it: patches change by less than a fifth of a pixel.
 STEP = 0.01
 
 
