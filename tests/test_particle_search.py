@@ -410,7 +410,7 @@ def test_tracers_are_counted_few_or_crowded_and_light_that_does_not_tell_is_not(
     assert crowded.measured == pytest.approx(12.0, rel=0.4)
     # What noise alone leaves is no light of tracers: where none was found it made 40 for each microlens.
     noise = np.random.default_rng(0).normal(100.0, 16.0, image.shape).astype(np.float32)
-    frame = frame_of(bench, noise, noise)
+    frame = frame_of(bench, noise, noise - np.float32(100.0))
     left = points_of(bench, frame, find(bench, frame), TracerSize(0.05), {}).attributes
     assert left["residual"] > 0.1
     assert "tracers_per_lens" not in left
