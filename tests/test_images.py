@@ -168,7 +168,7 @@ def test_haze_of_few_counts_is_found_where_a_count_is_of_many_photons(
         return
     assert found is not None
     assert abs(found.level_counts - haze) < 2.0 * error < 1.0
-    # A level that is told by few pixels may be as far off as the haze is bright.
+    # A level by few pixels may be as far off as the haze is bright.
     unsure, error = white.haze_in(recorded.astype(np.float32), np.ones(light.shape, np.bool_), (0.0, noise), 0.4 * haze)
     assert unsure is None
     assert error > haze

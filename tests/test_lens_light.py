@@ -93,7 +93,7 @@ def test_shift_is_found_so_well(images: LensImages, lattice: Lattice, shift: tup
 
 
 @pytest.mark.parametrize(("shift_px", "moved"), [(0.2, False), (0.25, True), (0.14, False)])
-def test_a_shift_is_told_that_is_certainly_harmful(lattice: Lattice, shift_px: float, moved: bool) -> None:
+def test_a_shift_is_reported_that_is_certainly_harmful(lattice: Lattice, shift_px: float, moved: bool) -> None:
     place = Place(np.array([0.0, shift_px]), 0.04)
     known = Mock(lattice_px=lattice, beside=lambda _: Beside((place,), 1.0, 0.01, True))
     reported = light_checks.position_notices(known, np.zeros(SHAPE), "board", "")

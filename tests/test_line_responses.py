@@ -137,7 +137,7 @@ def test_ball_is_the_mean_of_its_points() -> None:
     ("distance_mm", "point", "depth_mm"), [(185.0, (6.0, 0.03, 3.0), 0.002), (100.0, (2.47, 0.23, 2.8), 0.003)]
 )
 def test_oblique_rays_are_bent_more(distance_mm: float, point: tuple[float, ...], depth_mm: float) -> None:
-    """Far from the axis Snell's law shows a point nearer than on it, and aside; the first derivatives tell how much.
+    """Far from the axis Snell's law shows a point nearer than on it, and aside; the first derivatives show how much.
 
     Behind 95 mm of water each place of the aperture shows it aside by another length.
     """

@@ -340,10 +340,10 @@ def test_one_image_twice_and_few_links_are_told() -> None:
         assert [notice.code for notice in few_notices(counts, ("a", "b"), summary, tracks(1e-3))] == codes
 
 
-def told_of_board(
+def reported_of_board(
     camera: Camera, board: BoardGeometry, found: int, z_mm: float, magnification: float, tilt_deg: float = 0.0
 ) -> list[Notice]:
-    """Return what is told of a board of which so many points, row by row, were found, where the plane has them."""
+    """Return what is reported of a board of which so many points, row by row, were found, where the plane has them."""
     zeros, none = np.zeros((found, 3)), np.zeros(2)
     seen = (np.stack(np.divmod(np.arange(found), board.dots[0])[::-1], axis=1), zeros, zeros, zeros, zeros[:, :2])
     pose = BoardPose(*seen, z_mm, 0.0, np.array([0.0, tilt_deg]), none, 0.0, 0.0, none, none, magnification, 0.0)
@@ -351,18 +351,18 @@ def told_of_board(
 
 
 def test_boards_with_doubts_are_told(table2: Camera) -> None:
-    assert told_of_board(table2, BoardGeometry((3, 3), 0.6, 0.2), 9, 5.0, -1.0) == []
-    (reported,) = told_of_board(table2, BoardGeometry((3, 2), 0.6, 0.2), 6, 5.0, -1.0)
+    assert reported_of_board(table2, BoardGeometry((3, 3), 0.6, 0.2), 9, 5.0, -1.0) == []
+    (reported,) = reported_of_board(table2, BoardGeometry((3, 2), 0.6, 0.2), 6, 5.0, -1.0)
     assert (reported.code, reported.measured) == ("board-few-points", 6.0)
     scale = table2.scale(Media())
     board, larger = (BoardGeometry((5, 4), 0.6, size * scale.lens_mm) for size in (0.7, 1.1))
-    (reported,) = told_of_board(table2, board, 20, -0.1 * scale.depth_mm, -1.0)
+    (reported,) = reported_of_board(table2, board, 20, -0.1 * scale.depth_mm, -1.0)
     assert reported.code == "board-within-lenses"
     assert reported.measured == pytest.approx(0.8)
     # To where light spreads over two lenses.
     assert "by 1 mm" in reported.remedy
-    assert told_of_board(table2, board, 20, -0.4 * scale.depth_mm, -1.0) == []
-    assert told_of_board(table2, larger, 20, 0.0, -1.0) == []
+    assert reported_of_board(table2, board, 20, -0.4 * scale.depth_mm, -1.0) == []
+    assert reported_of_board(table2, larger, 20, 0.0, -1.0) == []
     board = BoardGeometry((5, 4), 0.6, 0.2)
     # Dots 0.5 mm apart that are said to be 0.6 show a magnification of 0.836.
     cases = (
@@ -378,7 +378,7 @@ def test_boards_with_doubts_are_told(table2: Camera) -> None:
         (20, -0.836, 0.0, ["magnification"]),
     )
     for found, magnification, tilt_deg, codes in cases:
-        assert [each.code for each in told_of_board(table2, board, found, 5.0, magnification, tilt_deg)] == codes
+        assert [each.code for each in reported_of_board(table2, board, found, 5.0, magnification, tilt_deg)] == codes
 
 
 def told_of(**measured: object) -> list[Notice]:

@@ -171,7 +171,7 @@ def test_a_board_tells_of_a_curved_field(small: Camera, rng: np.random.Generator
     assert found.value == pytest.approx(0.1, abs=5.0 * found.sigma)
     reported = [[each.code for each in board_notices(pose, board, small, Media())] for pose in (curved, flat)]
     assert ["field-curved" in codes for codes in reported] == [True, False]
-    # Dots that do not scatter still tell of corners that are far from them by what they may have in common.
+    # Dots that do not scatter are still unsure of corners far from them by what they may have in common.
     names = ("indices", "dots_mm", "dots_sigma_mm", "residual_mm", "dots_px")
     near = np.flatnonzero(np.maximum(np.abs(x), np.abs(y)) < 0.4)
     even = replace(flat, residual_mm=np.zeros_like(flat.residual_mm))

@@ -289,7 +289,7 @@ def rows_unseen(indices: Integers, board: BoardGeometry) -> Integers:
 def middle_doubt_mm(indices: Integers, board: BoardGeometry) -> Floats:
     """Return how far (2,) the board's middle may be from where it is taken to be along its rows and columns, rms.
 
-    On which side what is not seen lies no dot tells; `best_window` shares it between both.
+    No dot shows on which side the unseen ones lie; `best_window` shares it between both.
     """
     off = [np.arange(unseen + 1) - unseen // 2 for unseen in rows_unseen(indices, board).tolist()]
     return board.spacing_mm * np.array([np.sqrt(np.mean(each**2)) for each in off])

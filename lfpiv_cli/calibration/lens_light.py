@@ -38,7 +38,7 @@ LIGHT_SIGMAS = 3.0
 # Of a normal distribution these percentiles lie one and two standard deviations below its middle. So many pixels tell
 # them to a per cent.
 ONE_BELOW, TWO_BELOW, ENOUGH = 15.87, 2.275, 60_000
-# Standard error of the level that these percentiles tell, in the noise of one pixel over the root of their number.
+# Standard error of the level by these percentiles, in the noise of one pixel over the root of their number.
 LEVEL_ERROR = 3.3
 # Multiples of the golden section lie evenly between whole numbers, however many.
 GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)
@@ -253,7 +253,7 @@ def dark_level(pixels: NDArray[np.floating]) -> tuple[float, float]:
 
 
 def level_error(noise: float, pixels: int) -> float:
-    """Return the standard error of the level that `dark_level` tells by so many pixels of normal noise."""
+    """Return the standard error of the level that `dark_level` finds by so many pixels of normal noise."""
     return LEVEL_ERROR * noise / float(np.sqrt(max(pixels, 1)))
 
 

@@ -39,7 +39,7 @@ from lfpiv_cli.robust import weighted_median
 
 # How far charge diffuses in a sensor may differ from what is usual.
 USUAL_SIGMA_PX = 0.1
-# Where the images leave this much of that uncertainty, they hardly tell diffusion.
+# Where the images leave this much of that uncertainty, they hardly show diffusion.
 TOLD = 0.7
 # What is given is held by so small a standard error.
 HELD = 1e-6
@@ -100,7 +100,7 @@ class Together:
 
     @property
     def reported(self) -> bool:
-        """Whether the images tell diffusion, not what is usual."""
+        """Whether diffusion is by the images, not what is usual."""
         return bool(self.sigma_px < TOLD * USUAL_SIGMA_PX)
 
 
@@ -173,11 +173,11 @@ class FocalLength(NamedTuple):
 
 
 def focal_length_of(view: View, particles: Floats, residual: Floats, weight: Floats) -> FocalLength | None:
-    """Return what particles (n, 4) tell of the focal length; None where too few do.
+    """Return the focal length by particles (n, 4); None where too few show it.
 
     Parameters
     ----------
-    view : by rays; where the particles were found by waves they tell half of what is off
+    view : by rays; where the particles were found by waves half of what is off is seen
     residual, weight : (pixels,) what all particles leave of the image, and the inverse variances
     """
     if len(particles) < FEWEST_PARTICLES:
@@ -199,9 +199,9 @@ def focal_length_of(view: View, particles: Floats, residual: Floats, weight: Flo
 def _step(
     views: tuple[View, View], particle: Floats, residual: Floats, weight: Floats, room: int
 ) -> tuple[float, float] | None:
-    """Return the step from the first view that a particle (4,) tells, and its standard error.
+    """Return the step from the first view that a particle (4,) shows, and its standard error.
 
-    In differences of the other one; None where it tells nothing.
+    In differences of the other one; None where it shows nothing.
     """
     lit = []
     for view in views:
