@@ -1,6 +1,7 @@
 """Commands run in this process, and what they are run on: the sample, or Table 2's camera with a small sensor."""
 
 import json
+import signal
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,12 @@ AT_FOCUS = ("reference: mid_plane", "reference: focal_point")
 def run(*arguments: object) -> None:
     """Run a command; errors come out as exceptions."""
     cli.main([str(argument) for argument in arguments], standalone_mode=False)
+
+
+def hear_interrupts() -> None:
+    """Have a new process hear SIGINT, which shells have their background jobs ignore, and SIGHUP, as nohup has it."""
+    for sent in (signal.SIGINT, signal.SIGHUP):
+        signal.signal(sent, signal.SIG_DFL)
 
 
 def summary_of(capsys: pytest.CaptureFixture[str], *arguments: object) -> dict[str, Any]:

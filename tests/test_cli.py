@@ -14,8 +14,7 @@ import pytest
 from lfpiv_cli.cli.main import cli
 from lfpiv_cli.cli.options import GROUPS
 from lfpiv_cli.files import kernel_cache
-from tests.commands import CONFIG, ROOT, SAMPLE
-from tests.test_faults_by_command import hear_interrupts
+from tests.commands import CONFIG, ROOT, SAMPLE, hear_interrupts
 
 
 def lfpiv(*arguments: object, **options: object) -> subprocess.CompletedProcess[str]:

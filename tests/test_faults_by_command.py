@@ -22,7 +22,7 @@ from lfpiv_cli.flow.correlation import held_bytes
 from lfpiv_cli.flow.windows import CorrelationSettings
 from lfpiv_cli.grid import FOCAL_POINT
 from lfpiv_cli.verbs.planning import bench_of
-from tests.commands import AT_FOCUS, CONFIG, ROOT, SAMPLE, contents, sample_rig
+from tests.commands import AT_FOCUS, CONFIG, ROOT, SAMPLE, contents, hear_interrupts, sample_rig
 from tests.hostile_files import ended
 from tests.test_batches import QUICK
 from tests.test_particle_stage import frames_of
@@ -135,12 +135,6 @@ def test_what_was_killed_is_made_again(
     assert contents(made) == contents(whole)
     # What was killed half way is cleared away: nothing lies beside what was asked for.
     assert [path.name for path in folder.iterdir()] == [made.name]
-
-
-def hear_interrupts() -> None:
-    """Have a new process hear SIGINT, which shells have their background jobs ignore, and SIGHUP, as nohup has it."""
-    for sent in (signal.SIGINT, signal.SIGHUP):
-        signal.signal(sent, signal.SIG_DFL)
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no SIGTERM to send")

@@ -1,7 +1,6 @@
 """`run` over pairs in parts, in shares, by several workers; and while a camera writes them, with the files of `run`."""
 
 import json
-import os
 import re
 import shutil
 import signal
@@ -31,7 +30,7 @@ from lfpiv_cli.verbs.pairs import PairOptions, coming_pairs
 from lfpiv_cli.verbs.particles import Sized
 from lfpiv_cli.verbs.run import RIG
 from lfpiv_cli.verbs.simulate import frame_names
-from tests.commands import SAMPLE, sample_rig
+from tests.commands import SAMPLE, hear_interrupts, sample_rig
 from tests.commands import run as lfpiv
 from tests.test_batch_shares import Filling
 from tests.test_report import WARNING, put, record
@@ -362,8 +361,8 @@ def test_the_verdict_of_a_pair_knows_of_its_vectors_by_both_methods(
 def begun(config: Path, folder: Path, output: Path, *options: object) -> subprocess.Popen[str]:
     """Start a command that watches."""
     words = ["run", config, "--watch", folder, *PHOTOGRAPHS, "--method", "volumes", *options, "-o", output]
-    command = [sys.executable, "-m", "lfpiv_cli", *map(str, words)]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, env=os.environ)
+    command, heard = [sys.executable, "-m", "lfpiv_cli", *map(str, words)], {"stdout": subprocess.PIPE, "text": True}
+    return subprocess.Popen(command, stderr=subprocess.DEVNULL, preexec_fn=hear_interrupts, **heard)
 
 
 def lines_until(process: subprocess.Popen[str], name: str) -> list[str]:
