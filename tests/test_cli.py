@@ -95,19 +95,29 @@ def test_exit_codes_and_what_is_said(tmp_path) -> None:
     assert not target.exists()
 
 
-IGNORED_FIRST = """
+LOST_FIRST = """
 import ctypes, signal, sys, time
 from lfpiv_cli.cli.main import end_by_signals
 
 def called_back():
     signal.raise_signal(getattr(signal, sys.argv[1]))
 
+def dropped():
+    try:
+        called_back()
+    except BaseException:
+        pass
+
 end_by_signals()
 try:
-    ctypes.CFUNCTYPE(None)(called_back)()
-    print("ignored")
-    for _ in range(500):
-        time.sleep(0.01)
+    ctypes.CFUNCTYPE(None)(called_back)() if sys.argv[2] == "called back" else dropped()
+    print("lost")
+    try:
+        for _ in range(500):
+            time.sleep(0.01)
+    finally:
+        time.sleep(0.5)  # as files are removed: no signal is raised again meanwhile
+        print("cleared")
 except BaseException as error:
     print(type(error).__name__)
 """
@@ -122,10 +132,11 @@ except BaseException as error:
         ("SIGHUP", "HungUp", "hung up"),
     ],
 )
-def test_a_signal_during_a_call_back_is_not_lost(sent, name, said) -> None:
-    words, heard = [sys.executable, "-c", IGNORED_FIRST, sent], {"capture_output": True, "text": True}
+@pytest.mark.parametrize("where", ["called back", "dropped"])
+def test_a_signal_whose_exception_is_lost_is_raised_again(sent, name, said, where) -> None:
+    words, heard = [sys.executable, "-c", LOST_FIRST, sent, where], {"capture_output": True, "text": True}
     done = subprocess.run(words, check=True, timeout=60, preexec_fn=hear_interrupts, **heard)
-    assert done.stdout.split() == ["ignored", name]
+    assert done.stdout.split() == ["lost", "cleared", name]
     assert done.stderr == f"lfpiv: {said}\n"
 
 

@@ -12,7 +12,8 @@ import os
 import signal
 import sys
 from contextlib import suppress
-from threading import Lock, Thread, Timer
+from threading import Lock, Thread, get_ident
+from time import sleep
 from types import FrameType
 from typing import TYPE_CHECKING, Any, NoReturn
 
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
     from sys import UnraisableHookArgs
 
 
-# By then the call that ignored it has returned.
+# By then an exception has come to where it is caught.
 AGAIN_AFTER_S = 0.1
 # Windows has no SIGHUP.
 RAISED: dict[int, type[BaseException]] = {
@@ -36,7 +37,7 @@ RAISED: dict[int, type[BaseException]] = {
     signal.SIGTERM: Terminated,
     **({signal.SIGHUP: HungUp} if hasattr(signal, "SIGHUP") else {}),
 }
-# The signals that Python has heard of, and whether none has been answered yet.
+# The signals that Python has heard of while commands run, and whether none has been answered yet.
 _heard: list[int] = []
 _unanswered = Lock()
 
@@ -54,20 +55,27 @@ def end_by_signals() -> None:
     for number in RAISED:
         if signal.getsignal(number) is not signal.SIG_IGN:
             signal.signal(number, unwind)
-    sys.unraisablehook = _send_again
-    if sys.platform == "win32":
-        return
-    # Answered from a thread of its own: Python itself hears of a signal when a compiled call has returned.
-    heard, reported = os.pipe()
-    os.set_blocking(reported, False)
-    signal.set_wakeup_fd(reported, warn_on_full_buffer=False)
-    # What is sent to a forked process is none of this one's.
-    os.register_at_fork(after_in_child=lambda: signal.set_wakeup_fd(-1))
+    sys.unraisablehook = _say_unless_a_signal
+    unwound, heard = get_ident(), None
+    if sys.platform != "win32":
+        # Answered from a thread of its own: Python itself hears of a signal when a compiled call has returned.
+        heard, reported = os.pipe()
+        os.set_blocking(reported, False)
+        signal.set_wakeup_fd(reported, warn_on_full_buffer=False)
+        # What is sent to a forked process is none of this one's.
+        os.register_at_fork(after_in_child=lambda: signal.set_wakeup_fd(-1))
 
     def listen() -> None:
-        while (number := os.read(heard, 1)[0]) not in RAISED:
-            pass
-        _answer(number)
+        if heard is not None:
+            while (number := os.read(heard, 1)[0]) not in RAISED:
+                pass
+            _answer(number)
+        # Exceptions are lost in what a library calls back, as LLVM does for each kernel, and while source is compiled.
+        while True:
+            before = len(_heard)
+            sleep(AGAIN_AFTER_S)
+            if 0 < before == len(_heard) and not _unwinds(unwound):
+                signal.raise_signal(_heard[0])
 
     Thread(target=listen, daemon=True).start()
 
@@ -81,18 +89,19 @@ def _answer(number: int) -> None:
         os.write(2, f"{after_bars}lfpiv: {outcome_of(RAISED[number]())[0]}\n".encode())
 
 
-def _send_again(unraisable: UnraisableHookArgs) -> None:
-    """Send a signal again that arrived where Python ignores exceptions: when a library calls it back.
+def _unwinds(thread: int) -> bool:
+    """Return whether a thread handles an exception that a signal has raised, or one that came of it."""
+    raised: Any = sys._current_exceptions().get(thread)
+    error = raised[1] if isinstance(raised, tuple) else raised  # in Python 3.11, and from 3.12 on
+    while error is not None and not isinstance(error, tuple(RAISED.values())):
+        error = error.__context__
+    return error is not None
 
-    LLVM does for each kernel that is compiled or loaded.
-    """
-    for number, raised in RAISED.items():
-        if unraisable.exc_type is raised:
-            again = Timer(AGAIN_AFTER_S, signal.raise_signal, (number,))
-            again.daemon = True
-            again.start()
-            return
-    sys.__unraisablehook__(unraisable)
+
+def _say_unless_a_signal(unraisable: UnraisableHookArgs) -> None:
+    """Say what Python ignores, unless a signal has raised it: that one is raised again."""
+    if unraisable.exc_type not in RAISED.values():
+        sys.__unraisablehook__(unraisable)
 
 
 THREADS, SCREEN = "NUMBA_NUM_THREADS", "MPLBACKEND"
@@ -249,4 +258,5 @@ def main() -> NoReturn:
             if debug:
                 raise
             click.echo(printable(f"lfpiv: {message}"), err=True)
+    _heard.clear()
     sys.exit(code)
