@@ -1,16 +1,21 @@
-"""Commands run in this process, and what they are run on: the sample, or Table 2's camera with a small sensor."""
+"""Commands run in this process, how they end, and what they are run on: the sample, Table 2's camera, no files."""
 
 import json
+import os
 import signal
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
+import h5py
 import pytest
 import yaml
 
 from lfpiv_cli.cli.main import cli
+from lfpiv_cli.cli.options import outcome_of
 from lfpiv_cli.errors import InputError
+from lfpiv_cli.files.hdf5 import DIGEST, write_digest
 from lfpiv_cli.optics.media import Media
 
 ROOT = Path(__file__).parent.parent
@@ -88,3 +93,35 @@ def refused(read: Callable[[], object], *words: str) -> bool:
         return False
     assert all(word in message for word in words), message
     return True
+
+
+def ended(*arguments: object) -> tuple[int, str]:
+    """Run a command in this process; return its exit code and what it would say of it."""
+    try:
+        cli.main([str(argument) for argument in arguments], standalone_mode=False)
+    except BaseException as error:
+        message, code = outcome_of(error)
+        return code, message
+    return 0, ""
+
+
+def make_no_file(path: Path, kind: str) -> None:
+    """Put at a path what is no file of ours: a `folder`, a `pipe`, an `empty` file, `text`, or else nothing."""
+    if kind == "folder":
+        path.mkdir()
+    elif kind == "pipe":
+        os.mkfifo(path)
+    elif kind == "empty":
+        path.touch()
+    elif kind == "text":
+        path.write_text("hello")
+
+
+@contextmanager
+def edited(path: Path) -> Iterator[h5py.File]:
+    """Open a file of ours for an edit by somebody who knows of its check sum."""
+    with h5py.File(path, "r+") as file:
+        del file.attrs[DIGEST]
+        yield file
+        with suppress(ValueError, TypeError):  # of what is hostile there is none
+            write_digest(file)

@@ -1,6 +1,7 @@
-"""Rays followed in other ways than the package does, to compare with, and the tube that they go through."""
+"""Rays whose way is known, by other formulas than the program's; operators' columns as images, and their adjoints."""
 
 import numpy as np
+import pytest
 from numba import njit
 from numpy.typing import ArrayLike
 
@@ -11,6 +12,7 @@ from lfpiv_cli.optics.media import Media, Window, equivalent_object_distance, fl
 from lfpiv_cli.optics.shapes import Vector, dot, plus, scaled
 from lfpiv_cli.optics.surfaces import Cylinder, Faces, meet
 from lfpiv_cli.optics.tracing import disc_points, exact_slope, trace
+from lfpiv_cli.weights.model import Weights
 
 
 def tube_of(
@@ -124,3 +126,18 @@ def trace_out(faces: Faces, point: Vector, direction: Vector) -> tuple[float, fl
     path = (faces.lens_z_mm - point[2]) / direction[2]
     point = plus(point, path, direction)
     return point[0], point[1], -direction[0] / direction[2], -direction[1] / direction[2], path < 0.0
+
+
+def column_image(operator: Weights, *index: int) -> Floats:
+    """Return the image that the column of a voxel makes."""
+    image = np.zeros(operator.image_shape)
+    rows, columns, weights = operator.column(*index)
+    image[rows, columns] = weights
+    return image
+
+
+def assert_adjoint(operator: Weights, rng: np.random.Generator) -> None:
+    """The dot test: <A x, y> = <x, A* y>, to what float32 sums of some thousand terms leave."""
+    volume, image = rng.random(operator.shape, np.float32), rng.random(operator.image_shape, np.float32)
+    left = np.vdot(operator.forward(volume).astype(np.float64), image)
+    assert left == pytest.approx(np.vdot(volume.astype(np.float64), operator.adjoint(image)), rel=1e-5)

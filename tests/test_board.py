@@ -24,10 +24,8 @@ from lfpiv_cli.optics.media import Media
 from lfpiv_cli.optics.tracing import ObjectSpace, disc_points, trace
 from lfpiv_cli.synthetic import board as synthetic_board
 from lfpiv_cli.synthetic.board import BoardPlacement, render_board
-from tests.commands import table2_rig
-from tests.hostile_files import ended
-from tests.known_rays import slopes_equivalent
-from tests.operators import column_image
+from tests.commands import ended, table2_rig
+from tests.known_rays import column_image, slopes_equivalent
 
 BOARD = BoardGeometry((3, 3), 0.6, 0.2)
 # Twenty rays per lit pixel: a dot's depth is then known to some 0.03 mm, a board's to 0.01 mm.

@@ -23,8 +23,7 @@ from lfpiv_cli.verbs.frames import dt_notices
 from lfpiv_cli.verbs.run_steps import RunOptions
 from tests import camera_files
 from tests.camera_files import STEP_US, write_cine
-from tests.commands import CONFIG, run, sample_rig, table2_rig
-from tests.hostile_files import ended
+from tests.commands import CONFIG, ended, run, sample_rig, table2_rig
 from tests.test_particle_stage import write_frame
 
 ROWS, COLUMNS = 100, 120

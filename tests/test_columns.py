@@ -22,8 +22,7 @@ from lfpiv_cli.weights.model import Weights
 from lfpiv_cli.weights.operators import FactorisedOperator
 from lfpiv_cli.weights.quadrature import RayCount, count_columns, integrate_columns
 from tests.commands import table2_rig
-from tests.known_rays import slopes_equivalent
-from tests.operators import assert_adjoint, column_image
+from tests.known_rays import assert_adjoint, column_image, slopes_equivalent
 
 GRID = Grid.centred((4, 3, 5), (0.1, 0.12, 0.8), (0.1, -0.1, 0.5))
 # As far across, with voxels enough to tell the axes apart.

@@ -17,8 +17,7 @@ from lfpiv_cli.grid import Reference
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import fluid_path_to_focus
 from lfpiv_cli.verbs.reconstruct import ReconstructOptions
-from tests.commands import CONFIG, ROOT
-from tests.hostile_files import ended
+from tests.commands import CONFIG, ROOT, ended
 
 CONFIGS = sorted((ROOT / "configs").glob("*.yaml"))
 

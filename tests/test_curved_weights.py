@@ -31,8 +31,7 @@ from lfpiv_cli.weights.quadrature import RayCount, count_rays, integrate_columns
 from lfpiv_cli.weights.scene import aimed_misfit_mm, curved_padding, lit_voxels
 from lfpiv_cli.weights.strips import StripOperator, evenly_spread, mixed_shares
 from tests.commands import table2_rig
-from tests.known_rays import tube_of
-from tests.operators import assert_adjoint, column_image
+from tests.known_rays import assert_adjoint, column_image, tube_of
 
 VOXEL = (0.1, 0.1, 0.1)
 # Tiles across the aperture: with as many a column's own error is far below what chance makes of a count.

@@ -19,8 +19,8 @@ from lfpiv_cli.grid import Grid, Reference
 from lfpiv_cli.names import ExportFormat
 from lfpiv_cli.verbs.export import FORMATS
 from tests.commands import run
-from tests.read_back import same
 from tests.vector_fields import points_of
+from tests.written_files import same
 
 GRID = Grid((4, 3, 2), (0.1, 0.3, 0.7), (-0.15, 1 / 3, 2.0))
 REFERENCE = Reference("mid_plane", 0.1 + 0.2)

@@ -22,8 +22,7 @@ from lfpiv_cli.flow.correlation import held_bytes
 from lfpiv_cli.flow.windows import CorrelationSettings
 from lfpiv_cli.grid import FOCAL_POINT
 from lfpiv_cli.verbs.planning import bench_of
-from tests.commands import AT_FOCUS, CONFIG, ROOT, SAMPLE, contents, hear_interrupts, sample_rig
-from tests.hostile_files import ended
+from tests.commands import AT_FOCUS, CONFIG, ROOT, SAMPLE, contents, ended, hear_interrupts, sample_rig
 from tests.test_batches import QUICK
 from tests.test_particle_stage import frames_of
 from tests.vector_fields import SHAPE, field_of

@@ -20,8 +20,7 @@ from lfpiv_cli.files.provenance import record
 from lfpiv_cli.files.vtkhdf import open_vectors, open_volume, read_header, write_vectors, write_volume
 from lfpiv_cli.flow.field import VectorField
 from lfpiv_cli.grid import Grid, Reference
-from tests.commands import ROOT, refused
-from tests.hostile_files import edited
+from tests.commands import ROOT, edited, refused
 
 GRID = Grid.centred((4, 3, 2), (0.1, 0.2, 0.3), (1.0, 2.0, 3.0))
 REFERENCE = Reference("mid_plane", -0.3)

@@ -23,8 +23,7 @@ from lfpiv_cli.files import recording_formats as formats
 from lfpiv_cli.files.images import count_pages, read_image, read_single, write_tiff
 from lfpiv_cli.files.provenance import ensure_verified
 from tests import camera_files
-from tests.commands import CONFIG, ROOT, SAMPLE, refused
-from tests.hostile_files import ended
+from tests.commands import CONFIG, ROOT, SAMPLE, ended, refused
 
 ROWS, COLUMNS = 448, 600
 

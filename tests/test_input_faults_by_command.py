@@ -21,8 +21,7 @@ from lfpiv_cli.files.vtkhdf import open_vectors, write_vectors, write_volume
 from lfpiv_cli.files.weights_file import FORMAT, VERSION
 from lfpiv_cli.files.weights_file import UNITS as WEIGHT_UNITS
 from lfpiv_cli.grid import FOCAL_POINT, Grid
-from tests.commands import CONFIG, SAMPLE
-from tests.hostile_files import edited, ended
+from tests.commands import CONFIG, SAMPLE, edited, ended
 from tests.vector_fields import SHAPE, field_of, points_of
 
 

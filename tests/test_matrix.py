@@ -21,10 +21,8 @@ from lfpiv_cli.cli.options import FILE
 from lfpiv_cli.files.export_formats import read_content
 from lfpiv_cli.names import ExportFormat, names_in
 from lfpiv_cli.verbs.export import FORMATS
-from tests.commands import ROOT
-from tests.hostile_files import ended, make_no_file
-from tests.read_back import READERS, by_hdf5
-from tests.written_files import KINDS, WrittenFiles
+from tests.commands import ROOT, ended, make_no_file
+from tests.written_files import KINDS, READERS, WrittenFiles, by_hdf5
 
 RIGS = {"rig", "rig by init"}
 IMAGES = {"white image", "dark image", "board image", "frame", "residual image"}

@@ -21,8 +21,8 @@ from lfpiv_cli.files.particle_file import (
     write_points,
 )
 from lfpiv_cli.grid import Reference
-from tests.read_back import vtk_opened
 from tests.vector_fields import points_of
+from tests.written_files import vtk_opened
 
 REFERENCE = Reference("mid_plane", -0.4)
 

@@ -21,7 +21,7 @@ from lfpiv_cli.files.vtkhdf import open_vectors
 from lfpiv_cli.grid import Reference
 from lfpiv_cli.validation.volume import particle_figures
 from tests.commands import CONFIG, SAMPLE, run, summary_of
-from tests.read_back import vtk_opened
+from tests.written_files import vtk_opened
 
 LOW, HIGH = (-1.5, -1.1, -2.0), (1.5, 1.1, 2.0)
 

@@ -19,8 +19,7 @@ from lfpiv_cli.errors import InputError
 from lfpiv_cli.files.particle_file import read_particles
 from lfpiv_cli.files.vtkhdf import write_vectors
 from lfpiv_cli.grid import FOCAL_POINT
-from tests.commands import CONFIG, SAMPLE
-from tests.hostile_files import ended
+from tests.commands import CONFIG, SAMPLE, ended
 from tests.vector_fields import SHAPE, field_of
 
 

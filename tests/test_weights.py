@@ -19,8 +19,7 @@ from lfpiv_cli.weights.model import Weights
 from lfpiv_cli.weights.operators import adjoint_reference, forward_reference
 from lfpiv_cli.weights.quadrature import TILES, RayCount, count_rays, integrate_columns, sampling_error
 from lfpiv_cli.weights.scene import aperture_tiles, kernel_scene, on_array, rays_from
-from tests.known_rays import points_counted
-from tests.operators import assert_adjoint
+from tests.known_rays import assert_adjoint, points_counted
 
 RAYS = 400_000
 

@@ -14,8 +14,7 @@ import yaml
 
 from lfpiv_cli.errors import InputError, UsageError
 from lfpiv_cli.files.weights_file import WeightsFile, open_weights
-from tests.commands import ROOT, SAMPLE
-from tests.hostile_files import edited, ended
+from tests.commands import ROOT, SAMPLE, edited, ended
 
 
 def built(folder: Path, *options: object, layout: str = "square", padding: int = 0, **volume: object) -> Path:
