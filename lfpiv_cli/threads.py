@@ -101,9 +101,13 @@ def in_threads(work: Callable[[Item], Result], items: Iterable[Item]) -> list[Re
         # One that has not begun by now has nothing left to do.
         for other in [other for other in others if not other.cancel()]:
             other.result()
-    finally:
+    except BaseException as error:
         left.clear()
-        wait([other for other in others if not other.cancel()])
+        begun = [other for other in others if not other.cancel()]
+        # A signal waits for none: they hold what they work on, and one that compiles takes long.
+        if isinstance(error, Exception):
+            wait(begun)
+        raise
     return [done[place] for place in range(len(pieces))]
 
 

@@ -187,11 +187,34 @@ run.warm_up = broken
 sys.argv = ["lfpiv", "warm-up"]
 main()
 """
+# For minutes, as none of Python's threads can be stopped.
+WHILE_ANOTHER_THREAD_WORKS = """
+import hashlib, signal, sys, threading, time
+from lfpiv_cli.cli import main
+from lfpiv_cli.threads import in_threads, use_threads
+from lfpiv_cli.verbs import run
+
+def work(piece):
+    if threading.current_thread() is threading.main_thread():
+        time.sleep(0.5)
+        signal.raise_signal(signal.SIGTERM)
+    hashlib.pbkdf2_hmac("sha256", b"", b"", 1_000_000_000)
+
+def in_two_threads(*_, **__):
+    use_threads(2)
+    in_threads(work, range(2))
+
+run.warm_up = in_two_threads
+sys.argv = ["lfpiv", "warm-up"]
+main()
+"""
 
 
 @pytest.mark.skipif(os.name == "nt", reason="Windows has no SIGTERM to send")
-def test_what_a_library_makes_of_a_signal_is_no_bug() -> None:
-    done = subprocess.run([sys.executable, "-c", A_BROKEN_LIBRARY], capture_output=True, text=True, timeout=60)
+@pytest.mark.parametrize("script", [A_BROKEN_LIBRARY, WHILE_ANOTHER_THREAD_WORKS], ids=["library", "thread"])
+def test_a_signal_ends_a_command_whatever_a_library_makes_of_it_and_a_thread_does(script: str) -> None:
+    heard = {"capture_output": True, "text": True, "env": os.environ | {"NUMBA_NUM_THREADS": "2"}}
+    done = subprocess.run([sys.executable, "-c", script], timeout=40, **heard)
     assert (done.returncode, done.stderr) == (143, "lfpiv: terminated\n")
 
 

@@ -6,6 +6,7 @@ to be written is not.
 
 from __future__ import annotations
 
+import atexit
 import errno
 import io
 import os
@@ -258,5 +259,10 @@ def main() -> NoReturn:
             if debug:
                 raise
             click.echo(printable(f"lfpiv: {message}"), err=True)
+        if _heard:
+            # Python would wait for all threads, and one that compiles takes long.
+            atexit._run_exitfuncs()
+            sys.stdout.flush()
+            os._exit(code)
     _heard.clear()
     sys.exit(code)
