@@ -198,3 +198,11 @@ def test_blur_of_a_white_image_is_told(images: LensImages, lattice: Lattice, tab
 def test_the_error_of_a_dark_level_is_that_of_its_scatter(rng: np.random.Generator) -> None:
     levels = [dark_level(rng.normal(100.0, 10.0, 222))[0] for _ in range(300)]
     assert np.std(levels) == pytest.approx(level_error(10.0, 222), rel=0.15)
+
+
+@pytest.mark.parametrize("spread", [0.3, 0.5, 0.9])
+def test_the_dark_level_of_little_noise_is_not_moved_by_rounding(rng: np.random.Generator, spread: float) -> None:
+    for level in (0.0, 0.2, 0.5):
+        pixels = np.rint(rng.normal(level, spread, 5000))
+        assert dark_level(pixels) == pytest.approx((level, spread), abs=0.12)
+    assert dark_level(np.full(9, 2.0)) == (2.0, 0.0)

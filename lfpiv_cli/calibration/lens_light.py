@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
-from scipy.special import ndtr
+from scipy.special import ndtr, ndtri
 
 from lfpiv_cli.arrays import Floats, Integers, Singles
 from lfpiv_cli.calibration.lattice import LatticeFit
@@ -35,13 +35,10 @@ PARTS = 6
 FEWEST_BINS, MOST_BINS = 6, 24
 # Light is what stands out of the background by so many standard deviations of its noise.
 LIGHT_SIGMAS = 3.0
-# Of a normal distribution these percentiles lie one and two standard deviations below its middle. So many pixels tell
-# them to a per cent.
-ONE_BELOW, TWO_BELOW, ENOUGH = 15.87, 2.275, 60_000
-# Standard error of the level by these percentiles, in the noise of one pixel over the root of their number.
+# So many pixels tell what lies one and two standard deviations below the middle of a normal distribution to a per cent.
+ENOUGH = 60_000
+# Standard error of the middle by these two, in the noise of one pixel over the root of their number.
 LEVEL_ERROR = 3.3
-# Multiples of the golden section lie evenly between whole numbers, however many.
-GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)
 # Of noise alone this share of a standard deviation stands above three of them, on average; light is ten times of it.
 NOISE_LIGHT, TIMES_NOISE = 3.8e-4, 10.0
 # Gauss-Newton from the best of the bins settles to a thousandth of a pixel.
@@ -244,11 +241,12 @@ def dark_level(pixels: NDArray[np.floating]) -> tuple[float, float]:
     known = pixels[np.isfinite(pixels)]
     if not known.size:
         return 0.0, 0.0
-    # Whole counts are spread evenly over what was rounded: of little noise percentiles are steps.
-    values = np.unique(known)
+    # Whole counts are what was rounded to them: of little noise their percentiles are steps, and a normal distribution
+    # has as many below the edges between them.
+    values, number = np.unique(known, return_counts=True)
     step = float(np.diff(values).min()) if values.size > 1 else 0.0
-    rounded = step * ((GOLDEN * np.arange(known.size)) % 1.0 - 0.5)
-    two, one = np.percentile(known + rounded, [TWO_BELOW, ONE_BELOW])
+    below = np.concatenate([[0.5], np.minimum(np.cumsum(number), known.size - 0.5)]) / known.size
+    two, one = np.interp((-2.0, -1.0), ndtri(below), np.append(values[0] - 0.5 * step, values + 0.5 * step))
     return float(2.0 * one - two), float(one - two)
 
 
