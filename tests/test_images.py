@@ -151,20 +151,20 @@ def test_uneven_or_faint_haze_is_found(camera: Camera, water: Media, rng: np.ran
         assert faint.level_counts == pytest.approx(12.0, abs=3.0)
 
 
-@pytest.mark.parametrize(("count", "haze"), [(0.15, 1.8), (0.03, 1.4), (0.03, 0.7)])
+@pytest.mark.parametrize(("count", "haze"), [(0.15, 1.8), (0.03, 1.4), (0.03, 0.7), (0.02, 1.0), (0.03, 0.3)])
 def test_haze_of_few_counts_is_found_where_a_count_is_of_many_photons(
     camera: Camera, water: Media, rng: np.random.Generator, count: float, haze: float
 ):
-    """1.8 counts of noise of 2.4, and 1.4 of half a count, of which rounding leaves steps; 0.7 is an error."""
+    """1.8 counts of noise of 2.4, and 1.4 of half a count, of which rounding leaves steps; 0.3 is an error."""
     camera = replace(camera, columns=400, rows=320)
     true, white = white_of(camera, rng)
     noise, dark = count * BACKGROUND[1], np.ceil(100.0 * count)
     light = count * tracers(camera, water, 0.4, rng) + haze * true
     recorded = Readout(PHOTONS_PER_COUNT / count, noise, 0.0).record(light + dark, rng) - dark
     found, error = white.haze_in(recorded.astype(np.float32), np.ones(light.shape, np.bool_), (0.0, noise))
-    if haze < 1.0:
+    if haze < 0.5:
         assert found is None
-        assert error == pytest.approx(haze, rel=0.5)
+        assert haze < error < 2.0 * haze
         return
     assert found is not None
     assert abs(found.level_counts - haze) < 2.0 * error < 1.0

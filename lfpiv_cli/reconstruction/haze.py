@@ -50,8 +50,9 @@ UNEVENNESS, COOLING = 0.15, 0.7
 # noise the pixels that a tracer lights have much: with 2 standard deviations depths were 8 % too small.
 LEAST_DARK, LEAST_SIGMAS = 0.05, 2.5
 MUCH_DARK, LEAST_SIGMAS_OF_DARK = 0.15, 0.4
-# Fewer counts are what rounding leaves; a dark level that drifts is that of pixels between the lens images, too.
-LEAST_COUNTS = 1.0
+# Of fewer counts rounding leaves nothing or a whole one; a dark level that drifts is that of pixels between the lens
+# images, too. Whole counts are steps: the search begins no finer, and texture is looked at as far as the next count.
+LEAST_COUNTS, STEP_COUNTS = 0.5, 1.0
 # Rounding hides so much of the level between lens images, above which haze is (standard error).
 ROUNDING_COUNTS = 0.29
 # Where few pixels lie between lens images haze may be their level's error: it is above this many of it.
@@ -167,7 +168,7 @@ class White:
         found = self._darkest(pixels, light)
         if found is None:
             return None, 0.0
-        haze, sigma = found[0], max(found[1], noise, UNEVENNESS * float(np.median(found[0])), LEAST_COUNTS)
+        haze, sigma = found[0], max(found[1], noise, UNEVENNESS * float(np.median(found[0])), STEP_COUNTS)
         rest, whole = light - _between(haze, places), self._smoothed(pixels)
         for _ in range(ROUNDS):
             core = np.abs(rest) < CORE_SIGMAS * sigma
@@ -191,7 +192,7 @@ class White:
         if middle <= max(least, CERTAIN_SIGMAS * level_error):
             return None, math.hypot(middle, error) if dark else 0.0
         near = np.full(picture.shape, np.nan)
-        near.ravel()[pixels] = np.where(np.abs(rest) < NEAR_SIGMAS * sigma, rest, np.nan)
+        near.ravel()[pixels] = np.where(np.abs(rest) < NEAR_SIGMAS * sigma + STEP_COUNTS, rest, np.nan)
         if _in_common(near) > LARGEST_TEXTURE:
             return None, 0.0
         lit = np.maximum(_between(haze, self.places), 0.0).reshape(picture.shape) * self.light
