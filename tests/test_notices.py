@@ -249,7 +249,7 @@ camera:
   microlenses: {f_number: F_NUMBER, pitch_mm: 0.1}
   sensor:      {pixel_um: 5.5, columns: 600, rows: 448}
 media:   {air: 1.0, window: 1.0, fluid: 1.0}
-volume:  {shape_xyz: [10, 10, 10], voxel_mm: [0.005, 0.005, 0.01]}
+volume:  {shape_xyz: [10, 10, 10], voxel_mm: [0.005, 0.005, 0.1]}
 """
 
 

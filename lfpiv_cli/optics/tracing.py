@@ -347,6 +347,8 @@ def slope_ratios(lateral2_mm2: Floats, nodes: Floats, factors: Floats) -> Floats
 # Light that is further off falls into another pixel. The paper's channel and the sample are off by a tenth of this, its
 # simulation behind 134 mm of water by twice this.
 LARGEST_ERROR_PX = 0.5
+# A thin lens makes depths wrong by as large a share as the rim's ray at most, of which less does no harm.
+LARGEST_DEPTH_ERROR = 0.01
 
 
 def refraction_error_mm(camera: Camera, media: Media, window: Window | None, depths_mm: Floats) -> float:

@@ -82,10 +82,11 @@ def ray_notices(
             remedy = "--refraction exact" if window else "give the section window, or channel, and --refraction exact"
             notices.append(Notice("paraxial-refraction", "weights.refraction", text, remedy, bent_px, limit))
     error_px = tracing.sine_error_mm(camera, source.media, depths) / camera.pixel_mm
-    if error_px > tracing.LARGEST_ERROR_PX:
+    share = 1.0 - float(np.cos(np.arctan(tracing.rim_tangent(camera))))
+    if error_px > tracing.LARGEST_ERROR_PX and share > tracing.LARGEST_DEPTH_ERROR:
         text = (
             f"NA {_na(camera):.2f}: the rays of a thin lens are off by {written(error_px, 2)} px on the array at the "
-            f"volume's faces, {limit} without harm; depths will be wrong"
+            f"volume's faces, {limit} without harm; depths are wrong by up to {share:.1%}"
         )
         remedy = "a smaller aperture or a thinner volume, or boards at several depths and weights.method: dlfc"
         notices.append(Notice("paraxial-lens", "camera.main_lens.aperture_mm", text, remedy, error_px, limit))
