@@ -127,7 +127,7 @@ def uneven(shape: tuple[int, int], level: float, rng: np.random.Generator) -> np
 def seen(image: np.ndarray, white: White, rng: np.random.Generator) -> Haze | None:
     """Return the haze in what a sensor records of an expected image."""
     recorded = READOUT.record(image + 100.0, rng).astype(np.float32) - 100.0
-    return white.haze_in(recorded, np.ones(image.shape, np.bool_), BACKGROUND)[0]
+    return white.haze_in(recorded, np.ones(image.shape, np.bool_), BACKGROUND, 0.0)[0]
 
 
 @pytest.mark.parametrize("level", [100.0, 1500.0])
@@ -161,7 +161,7 @@ def test_haze_of_few_counts_is_found_where_a_count_is_of_many_photons(
     noise, dark = count * BACKGROUND[1], np.ceil(100.0 * count)
     light = count * tracers(camera, water, 0.4, rng) + haze * true
     recorded = Readout(PHOTONS_PER_COUNT / count, noise, 0.0).record(light + dark, rng) - dark
-    found, error = white.haze_in(recorded.astype(np.float32), np.ones(light.shape, np.bool_), (0.0, noise))
+    found, error = white.haze_in(recorded.astype(np.float32), np.ones(light.shape, np.bool_), (0.0, noise), 0.0)
     if haze < 0.5:
         assert found is None
         assert haze < error < 2.0 * haze
@@ -182,7 +182,7 @@ def test_tracers_are_no_haze(camera: Camera, water: Media, rng: np.random.Genera
     readout = replace(READOUT, photons_per_count=photons_per_count)
     for per_lens in (0.05, 0.6, 1.3, 1.6, 2.0, 4.0, 6.0):
         image = readout.record(tracers(camera, water, per_lens, rng) + 100.0, rng).astype(np.float32) - 100.0
-        assert white.haze_in(image, np.ones(image.shape, np.bool_), BACKGROUND)[0] is None, per_lens
+        assert white.haze_in(image, np.ones(image.shape, np.bool_), BACKGROUND, 0.0)[0] is None, per_lens
 
 
 def test_another_dark_level_is_no_haze(table2: Camera, water: Media, rng: np.random.Generator):
@@ -190,7 +190,7 @@ def test_another_dark_level_is_no_haze(table2: Camera, water: Media, rng: np.ran
     camera = replace(table2, columns=400, rows=320)
     true, white = white_of(camera, rng)
     image = READOUT.record(tracers(camera, water, 0.2, rng) + 100.0, rng).astype(np.float32)
-    assert white.haze_in(image, np.ones(true.shape, np.bool_), (100.0, BACKGROUND[1]))[0] is None
+    assert white.haze_in(image, np.ones(true.shape, np.bool_), (100.0, BACKGROUND[1]), 0.0)[0] is None
 
 
 def test_noise_of_dark_pixels_holds_the_haze_s_shot_noise():

@@ -149,7 +149,7 @@ class White:
         return cls(light, lenses, np.ascontiguousarray(places.T[::-1], np.float32), plateau)
 
     def haze_in(
-        self, picture: Singles, usable: Flags, background: tuple[float, float], level_error: float = 0.0
+        self, picture: Singles, usable: Flags, background: tuple[float, float], level_error: float
     ) -> tuple[Haze | None, float]:
         """Return the haze in a raw picture (rows, columns) less its dark image, and its standard error in counts.
 
@@ -189,12 +189,11 @@ class White:
         told_by = 4.0 * np.pi * SMOOTH_LENSES**2 * float(np.median(count))
         error = math.hypot(CORE_ERROR * sigma / math.sqrt(max(told_by, 1.0)), ROUNDING_COUNTS, level_error)
         least = max((LEAST_SIGMAS_OF_DARK if dark else LEAST_SIGMAS) * sigma, LEAST_COUNTS)
-        if middle <= max(least, CERTAIN_SIGMAS * level_error):
-            return None, math.hypot(middle, error) if dark else 0.0
+        faint = middle <= max(least, CERTAIN_SIGMAS * level_error)
         near = np.full(picture.shape, np.nan)
         near.ravel()[pixels] = np.where(np.abs(rest) < NEAR_SIGMAS * sigma + STEP_COUNTS, rest, np.nan)
-        if _in_common(near) > LARGEST_TEXTURE:
-            return None, 0.0
+        if faint or _in_common(near) > LARGEST_TEXTURE:
+            return None, math.hypot(middle, error) if faint and dark else 0.0
         lit = np.maximum(_between(haze, self.places), 0.0).reshape(picture.shape) * self.light
         return Haze(lit.astype(np.float32), middle), error
 
