@@ -218,10 +218,8 @@ def test_the_claim_of_a_dead_worker_is_taken_over(weights, images, tmp_path, cap
     claim.write_text("" if fate == "half written" else json.dumps({"host": host, "process": dead.pid}))
     if fate != "dead":
         os.utime(claim, (time.time() - 2 * DEAD_AFTER_S,) * 2)
-    assert (
-        summary_of(capsys, "reconstruct", weights, images[0], *QUICK, "-o", tmp_path / "f0.vtkhdf")["reconstructed"]
-        == 1
-    )
+    summary = summary_of(capsys, "reconstruct", weights, images[0], *QUICK, "-o", tmp_path / "f0.vtkhdf")
+    assert summary["reconstructed"] == 1
     assert not claims_in(tmp_path)
 
 
@@ -312,11 +310,10 @@ def test_a_pair_with_a_bad_frame_stays_as_it_is(tmp_path, capsys) -> None:
     with pytest.raises(PartialError):
         run(*beside, "--keep-going")
     assert stamps(out) == before
-    summary = summary_of(
-        capsys, "reconstruct", tmp_path / "weights.h5", images[1], *dark, "-o", tmp_path / "alone.vtkhdf"
-    )
+    paths = out / "pair_b.vtkhdf", tmp_path / "alone.vtkhdf"
+    summary = summary_of(capsys, "reconstruct", tmp_path / "weights.h5", images[1], *dark, "-o", paths[1])
     assert summary["particle_diameter_measured_mm"] == pytest.approx(0.05, rel=0.2)
-    found, alone = (read_points(path, PARTICLES_FORMAT) for path in (out / "pair_b.vtkhdf", tmp_path / "alone.vtkhdf"))
+    found, alone = (read_points(path, PARTICLES_FORMAT) for path in paths)
     np.testing.assert_array_equal(found.position_mm, alone.position_mm)
     images[0].write_bytes(whole)
     with pytest.raises(OutputExistsError, match="pair_b.vtkhdf: exists and was made from other inputs"):
@@ -351,10 +348,8 @@ def test_two_workers_share_a_folder_and_a_killed_one_is_replaced(weights, raw, t
 
 @pytest.mark.parametrize("command", ["reconstruct", "correlate"])
 def test_a_dry_run_tells_and_writes_nothing(weights, images, pairs, tmp_path, capsys, command) -> None:
-    given = {
-        "reconstruct": (weights, *images, *QUICK),
-        "correlate": (*pairs, "--pairing", "ab", "--windows", 8, "--derived"),
-    }[command]
+    fields = (*pairs, "--pairing", "ab", "--windows", 8, "--derived")
+    given = (weights, *images, *QUICK) if command == "reconstruct" else fields
     words = (command, *given, "-o", tmp_path / "out", "--failures", tmp_path / "failed.json")
     before = stamps(tmp_path)
     summary = summary_of(capsys, *words, "--log", tmp_path / "log", "--dry-run")
@@ -393,32 +388,20 @@ def test_a_dry_run_believes_what_is_there_and_the_log(weights, images, tmp_path,
 
 
 def test_a_dry_run_ends_as_the_batch_would(weights, images, pairs, tmp_path, capsys) -> None:
-    output = ("-o", tmp_path / "out", "--dry-run")
-    run("reconstruct", weights, *images[1:], *QUICK, *output[:2])
+    output = (*QUICK, "-o", tmp_path / "out")
+    run("reconstruct", weights, *images[1:], *output)
     with pytest.raises(OutputExistsError):
-        run("reconstruct", weights, *images, *QUICK, *output)
+        run("reconstruct", weights, *images, *output, "--dry-run")
     with pytest.raises(UsageError, match="same output"):
-        run("reconstruct", weights, images[0], images[0], *QUICK, *output)
+        run("reconstruct", weights, images[0], images[0], *output, "--dry-run")
     spoil(images[0], "empty")
     with pytest.raises(InputError, match="f0.tif: is empty"):
-        run("reconstruct", weights, *images, *QUICK, *output)
-    summary = summary_of(
-        capsys, "reconstruct", weights, *images, *QUICK, *output[:2], "--keep-going", "--resume", "--dry-run"
-    )
+        run("reconstruct", weights, *images, *output, "--dry-run")
+    summary = summary_of(capsys, "reconstruct", weights, *images, *output, "--keep-going", "--resume", "--dry-run")
     assert (summary["to_make"], summary["skipped"], summary["unreadable"]) == (0, 2, 1)
     (tmp_path / "b1.vtkhdf").write_bytes(pairs[3].read_bytes()[:-200])
-    command = (
-        "correlate",
-        *pairs[:3],
-        tmp_path / "b1.vtkhdf",
-        "--pairing",
-        "ab",
-        "--windows",
-        8,
-        "-o",
-        tmp_path / "two",
-    )
-    summary = summary_of(capsys, *command, "--keep-going", "--dry-run")
+    words = ("correlate", *pairs[:3], tmp_path / "b1.vtkhdf", "--pairing", "ab", "--windows", 8, "-o", tmp_path / "two")
+    summary = summary_of(capsys, *words, "--keep-going", "--dry-run")
     assert (summary["to_make"], summary["unreadable"]) == (1, 1)
 
 

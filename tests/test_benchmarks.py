@@ -252,10 +252,8 @@ def test_verdicts_and_their_summary() -> None:
     assert outcome_of({}, Step("build-weights", 1, "ValueError", [], 1.0)).verdict == "failed"
     assert outcome_of(fine, done, Step("correlate", 4, "no", [], 1.0)).verdict == "failed"
     # An image without tracers: `track` says why.
-    dark, why = (
-        Step("reconstruct particles", 0, "", ["lfpiv: left [light-unexplained]"], 1.0),
-        "none; left [light-unexplained]",
-    )
+    dark = Step("reconstruct particles", 0, "", ["lfpiv: left [light-unexplained]"], 1.0)
+    why = "none; left [light-unexplained]"
     assert outcome_of({}, dark, Step("track", 4, why, [], 1.0)).verdict == "refused"
     assert outcome_of({}, dark, Step("track", 4, "none", [], 1.0)).verdict == "failed"
     # No track at all; an index that is off by as much as `check` says, and by more.

@@ -256,10 +256,8 @@ def test_grid_is_centred_and_moved_and_voxels_chosen_by_the_program_fill_the_siz
 def test_windows_in_voxels_and_millimetres(write) -> None:
     config = load_rig(write("correlation: {window_mm: 1.6}\n"))
     assert config.windows_voxel((0.1, 0.1, 0.2))[-1] == (16, 16, 8)
-    assert load_rig(write("correlation: {windows: [32, [16, 16, 8]]}\n")).windows_voxel((1, 1, 1)) == (
-        (32, 32, 32),
-        (16, 16, 8),
-    )
+    config = load_rig(write("correlation: {windows: [32, [16, 16, 8]]}\n"))
+    assert config.windows_voxel((1, 1, 1)) == ((32, 32, 32), (16, 16, 8))
     # Cubes by default, as far as long voxels allow.
     config = load_rig(write("correlation: {dt_s: 0.001}\n"))
     assert config.windows_voxel((0.1, 0.1, 0.1)) == ((32, 32, 32), (16, 16, 16))
@@ -321,11 +319,8 @@ def test_flow_centres_move_with_the_origin(write) -> None:
 
 
 def test_what_follows_from_other_sections_unless_given(write) -> None:
-    for sections, exponent in (
-        ("reconstruction: {solver: em}", 0.5),
-        ("reconstruction: {solver: sart}", 1.0),
-        ("correlation: {exponent: 0.75}", 0.75),
-    ):
+    exponents = {"reconstruction: {solver: em}": 0.5, "reconstruction: {solver: sart}": 1.0}
+    for sections, exponent in (exponents | {"correlation: {exponent: 0.75}": 0.75}).items():
         assert load_rig(write(RIG + sections)).correlation_settings((1.0, 1.0, 1.0)).exponent == exponent
     for sections, methods in (
         ("", ("volumes", "particles")),

@@ -119,6 +119,20 @@ def test_plane_faces_have_the_weights_of_plane_layers(table2, water, window, pla
         assert np.abs(column_image(strips, *index) - column_image(whole, *index)).sum() < 0.005
 
 
+def column_errors(strips, columns, voxels):
+    """L1 (n,) between the columns of strips, which light as they say, and converged ones."""
+    errors = []
+    for voxel in voxels:
+        alone = np.zeros(strips.shape, np.float32)
+        alone.flat[voxel] = 1.0
+        column = column_image(strips, *map(int, np.unravel_index(voxel, strips.shape)))
+        np.testing.assert_allclose(strips.forward(alone), column, atol=1e-8)
+        centre = columns.centres_mm(np.array([voxel]))
+        converged = integrate_columns(columns.camera, columns.source, centre, columns.sides_mm, 128, 5)
+        errors.append(np.abs(column - converged.image(0, strips.image_shape)).sum())
+    return errors
+
+
 @pytest.mark.thorough
 @pytest.mark.parametrize("column_axis", ["x", "y"])
 @pytest.mark.parametrize("axis", [(1.0, 0.0, 0.0), (0.0, 1.0, 0.0)])
@@ -130,16 +144,9 @@ def test_strips_are_adjoint_and_light_what_columns_say(table2, water, rng, colum
     assert operator.turned == ((column_axis == "x") != bool(axis[0]))
     weights = Weights(grid, (0, 0, 0), operator, column_axis)
     assert_adjoint(weights, rng)
-    layout = OnDemandOperator(camera, tube_of(water, axis), grid)
-    errors = []
-    for index in list(np.ndindex(*operator.shape))[::41]:
-        alone = np.zeros(operator.shape, np.float32)
-        alone[index] = 1.0
-        column = column_image(operator, *index)
-        np.testing.assert_allclose(operator.forward(alone), column, atol=1e-8)
-        centre = layout.centres_mm(np.array([np.ravel_multi_index(index, operator.shape)]))
-        converged = integrate_columns(camera, layout.source, centre, layout.sides_mm, 128, 5)
-        errors.append(np.abs(column - converged.image(0, operator.image_shape)).sum())
+    errors = column_errors(
+        operator, OnDemandOperator(camera, tube_of(water, axis), grid), range(0, operator.lit.size, 41)
+    )
     # Beside the axis, where the two axes know most of each other; in the middle of the tube it is 0.005 to 0.02.
     assert np.median(errors) < 0.025
     assert np.max(errors) < 0.035
@@ -176,16 +183,7 @@ def test_strips_follow_a_tube_that_runs_a_little_aslant(table2, water, rng, monk
     operator = operator_of(camera, tube, grid)
     assert isinstance(operator, StripOperator)
     assert_adjoint(operator, rng)
-    layout = OnDemandOperator(camera, tube, grid)
-    errors = []
-    for flat in np.flatnonzero(operator.lit)[::97]:
-        index = np.unravel_index(flat, operator.shape)
-        alone = np.zeros(operator.shape, np.float32)
-        alone[index] = 1.0
-        column = column_image(operator, *(int(k) for k in index))
-        np.testing.assert_allclose(operator.forward(alone), column, atol=1e-8)
-        converged = integrate_columns(camera, tube, layout.centres_mm(np.array([flat])), layout.sides_mm, 128, 5)
-        errors.append(np.abs(column - converged.image(0, operator.image_shape)).sum())
+    errors = column_errors(operator, OnDemandOperator(camera, tube, grid), np.flatnonzero(operator.lit)[::97])
     straight = operator_of(camera, tube_of(water), grid)
     for of in (np.median, np.max):
         assert of(errors) < of(straight.misfit_l1) + 0.004  # what mixing may cost

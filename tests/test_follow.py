@@ -150,10 +150,8 @@ def test_a_frame_of_another_sequence_is_said(rig: Path, tmp_path: Path, capsys: 
 def test_both_ways_keep_what_was_found_forwards(rig: Path, followed: Path, tmp_path: Path) -> None:
     follow(rig, tmp_path / "run", "--both-ways", "--residuals", "--threads", 1)
     assert_right(tracks_of(tmp_path / "run"))
-    forwards, one_way = (
-        lf.open_particles(tmp_path / "run" / "forwards" / "frame_2.vtkhdf"),
-        particle_files(followed)[2],
-    )
+    forwards = lf.open_particles(tmp_path / "run" / "forwards" / "frame_2.vtkhdf")
+    one_way = particle_files(followed)[2]
     np.testing.assert_array_equal(forwards.position_mm, lf.open_particles(one_way).position_mm)
     for number in range(FRAMES):
         assert (tmp_path / "run" / "forwards" / f"frame_{number}.vtkhdf").is_file()

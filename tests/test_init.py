@@ -126,11 +126,8 @@ def test_lengths_are_understood_with_their_units_and_a_turned_sign_is_said(spell
     done = typed("\n".join(words.split("|") if "|" in words else words.split()) + "\n", str(path))
     assert done.exit_code == 0, done.output
     reported = yaml.safe_load(path.read_text())
-    assert reported["camera"]["main_lens"] == {
-        "magnification": -0.7,
-        "focal_length_mm": 105.0,
-        "f_number": 105.0 / 18.75,
-    }
+    main_lens = {"magnification": -0.7, "focal_length_mm": 105.0, "f_number": 105.0 / 18.75}
+    assert reported["camera"]["main_lens"] == main_lens
     assert reported["camera"]["microlenses"] == {"focal_length_mm": 1.0, "pitch_mm": 0.125}
     assert reported["camera"]["sensor"]["pixel_um"] == 5.5
     assert reported["channel"] == {"width_mm": 12.0, "wall_mm": 5.0}

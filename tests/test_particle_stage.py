@@ -117,11 +117,7 @@ def test_few_particles_are_tracked_and_said(
 def test_nothing_to_track_is_an_error_and_no_tracks_are_said(
     counts: list[int], tmp_path: Path, rng: np.random.Generator, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    said = dict(
-        zip(
-            ("code", "about", "text", "remedy"), ("light-unexplained", "a.tif", "99% is left", "calibrate"), strict=True
-        )
-    )
+    said = {"code": "light-unexplained", "about": "a.tif", "text": "99% is left", "remedy": "calibrate"}
     paths = frames_of(counts, tmp_path, rng)
     write_frame(paths[counts.index(0)], np.zeros((0, 3)), warnings=[said | {"code": "haze"}, said])
     with pytest.raises(InputError, match="no particles; tracks need some in two frames") as refused:

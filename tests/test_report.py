@@ -210,10 +210,8 @@ def test_the_first_line_tells_all_at_once(results: Path, tmp_path: Path, monkeyp
 
 def few_planes(planes: int) -> set[str]:
     """Return what a field of some planes across z says against itself."""
-    moved, grid = (
-        steady_mm()[:planes] / vector_fields.VOXEL_MM,
-        Grid((*SHAPE[:0:-1], planes), (0.8, 0.6, 1.1), (0.0,) * 3),
-    )
+    moved = steady_mm()[:planes] / vector_fields.VOXEL_MM
+    grid = Grid((*SHAPE[:0:-1], planes), (0.8, 0.6, 1.1), (0.0,) * 3)
     few = vector_fields.field_on(grid, moved, None, np.broadcast_to(SIGMA_VOXEL, moved.shape), vector_fields.VOXEL_MM)
     return {line.reason for line in checks.of_vectors(few, "f") if line.verdict != "good"}
 

@@ -217,10 +217,9 @@ def test_shear_within_a_bin_is_no_fluctuation(rng: np.random.Generator) -> None:
     sigma = found.found.moments.sigma
     off = found.found.moments.stress / sigma[:, STRESS]
     assert np.sqrt(np.mean(off**2)) < 1.3
-    away = found.mean.velocity - shear(found.mean.grid.centres_mm().reshape(-1, 3), 0).reshape(
-        found.mean.velocity.shape
-    )
-    away, stated = away[..., :2], found.arrays()["velocity_sigma"][0][..., :2]
+    velocity = found.mean.velocity
+    away = (velocity - shear(found.mean.grid.centres_mm().reshape(-1, 3), 0).reshape(velocity.shape))[..., :2]
+    stated = found.arrays()["velocity_sigma"][0][..., :2]
     assert np.sqrt(np.mean((away / stated) ** 2)) == pytest.approx(1.0, abs=0.3)
     # Were it one, it would be a hundred standard errors.
     dt_s = float(found.mean.dt_s or DT_S)
@@ -403,10 +402,8 @@ def test_files_become_one_of_statistics(folder: Path, capsys: pytest.CaptureFixt
     np.testing.assert_array_equal(again.mean.velocity, open_vectors(out).velocity)
     with pytest.raises(OutputExistsError):
         run("statistics", folder / "vectors", "-o", out)
-    assert (
-        summary_of(capsys, "statistics", folder / "vectors", "--profile", "x@y=0.8", "-o", out, "--resume")["skipped"]
-        == 1
-    )
+    again = ("statistics", folder / "vectors", "--profile", "x@y=0.8", "-o", out, "--resume")
+    assert summary_of(capsys, *again)["skipped"] == 1
     with pytest.raises(OutputExistsError, match="other inputs or settings"):
         run("statistics", folder / "vectors", "-o", out, "--resume")
     # One pair tells no fluctuations, and its figures no convergence.

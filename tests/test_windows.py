@@ -77,12 +77,6 @@ MORE_LAYOUTS = [(*each, 2) for each in (*LAYOUTS, ((8, 7, 6), (0.75, 0.5, 0.0)),
 MORE_LAYOUTS += [((70, 4, 3), HALF, 1), ((8, 7, 6), HALF, 4)]
 
 
-def layout_of(
-    size: tuple[int, int, int], overlap: tuple[float, float, float], weighting: Weighting = "gaussian"
-) -> WindowLayout:
-    return replace(layout_windows((22, 20, 18), size, overlap), weighting=weighting)
-
-
 def weights_in(layout: WindowLayout) -> Floats:
     """The weights [z, y, x] of a window's voxels, by the definition: a Gaussian of a quarter of the size, or one."""
     if layout.weighting == "uniform":
@@ -144,7 +138,8 @@ def test_maps_are_the_symmetric_normalised_correlation(
 def test_moments_are_weighted_sums_of_those_of_single_voxels(
     size: tuple[int, int, int], overlap: tuple[float, float, float], rng: np.random.Generator
 ) -> None:
-    layout, single = layout_of(size, overlap), layout_windows((22, 20, 18), (1, 1, 1), (0.0, 0.0, 0.0))
+    layout, single = (layout_windows((22, 20, 18), *each) for each in ((size, overlap), ((1, 1, 1), (0.0, 0.0, 0.0))))
+    layout = replace(layout, weighting="gaussian")
     a, b = rng.random((2, 18, 20, 22)).astype(np.float32)
     valid = (rng.random(a.shape) < 0.97).astype(np.uint8)
     before, after = margins(layout, a.shape, 1)
