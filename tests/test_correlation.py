@@ -174,9 +174,7 @@ def test_linear_shear_is_found_up_to_the_borders(rng: np.random.Generator) -> No
     shape = (48, 48, 48)
 
     def shear(points: Floats) -> Floats:
-        moved = np.zeros(points.shape)
-        moved[:, 0] = 0.08 * (points[:, 2] - 23.5)
-        return moved
+        return np.outer(0.08 * (points[:, 2] - 23.5), (1.0, 0.0, 0.0))
 
     a, b = moving_pair(shear, shape, rng)
     field = correlate([(a, b)], unit_grid(shape), COMMON)
@@ -203,9 +201,7 @@ def test_long_particles_do_not_flatten_a_curved_flow(rng: np.random.Generator) -
     shape = (40, 40, 96)
 
     def wave(points: Floats) -> Floats:
-        moved = np.zeros(points.shape)
-        moved[:, 0] = 1.5 * np.cos(2.0 * np.pi * points[:, 2] / 96.0)
-        return moved
+        return np.outer(1.5 * np.cos(2.0 * np.pi * points[:, 2] / 96.0), (1.0, 0.0, 0.0))
 
     a, b = moving_pair(wave, shape, rng, per_window=40.0, sigma=(1.0, 1.0, 8.0))
     field = correlate([(a, b)], unit_grid(shape), COMMON)

@@ -178,9 +178,7 @@ def test_one_displacement_is_found_without_bias_and_its_errors_are_stated(rng: n
 @pytest.mark.thorough
 def test_a_curved_shear_loses_less_than_in_uniform_windows(rng: np.random.Generator) -> None:
     def wave(points: Floats) -> Floats:
-        moved = np.zeros(points.shape)
-        moved[:, 0] = 0.8 * np.sin(2.0 * np.pi * points[:, 1] / 32.0)
-        return moved
+        return np.outer(0.8 * np.sin(2.0 * np.pi * points[:, 1] / 32.0), (1.0, 0.0, 0.0))
 
     kept = []
     for weighting in names_in(Weighting):
