@@ -12,6 +12,7 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numba import float64
+from numba.core.typing.typeof import typeof_impl
 from numpy.typing import NDArray
 
 from lfpiv_cli.arrays import Floats
@@ -37,7 +38,7 @@ from lfpiv_cli.particles.least_squares import (
     room_for,
 )
 from lfpiv_cli.particles.refraction import on_line_of_sight
-from lfpiv_cli.particles.view import View, entry_capacity, over_tiles
+from lfpiv_cli.particles.view import View, entry_capacity, over_tiles, type_by_form
 
 # Candidates are brought into the fit from these depths beside their own, in depths over which light spreads by one lens
 # (Table 2: 0.4 mm).
@@ -194,6 +195,9 @@ class Fitter(NamedTuple):
 
     to: tuple[Observation, Fit]
     best: Callable[[tuple[Observation, Fit], Floats, Floats, Responses, Choice, tuple[float, float], Floats], float]
+
+
+typeof_impl.register(Fitter)(type_by_form)
 
 
 def fitter_of(observation: Observation) -> Fitter:
