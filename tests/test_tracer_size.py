@@ -37,11 +37,17 @@ def image_of(camera: Camera, media: Media, tracers: Floats, lenses: float, waves
 
 
 def tasks_of(
-    camera: Camera, media: Media, images: list[Floats], rng: np.random.Generator, assumed: float = 0.5, **how: Light
+    camera: Camera,
+    media: Media,
+    images: list[Floats],
+    rng: np.random.Generator,
+    assumed: float = 0.5,
+    photons: float = 0.5,
+    **how: Light,
 ) -> list[Task]:
-    """Return the tasks that images set whose tracers are taken to be so many microlenses wide."""
+    """Return the tasks that images set whose tracers are taken to be so many microlenses wide; photons per count."""
     grid = Grid.centred((11, 10, 9), (0.1, 0.1, 0.2), (0.0, 0.0, 1.25))
-    noisy = [rng.poisson(0.5 * image) / 0.5 + rng.normal(0.0, 6.0, image.shape) for image in images]
+    noisy = [rng.poisson(photons * image) / photons + rng.normal(0.0, 6.0, image.shape) for image in images]
     return [task_for(image, camera, media, grid, 0.5 * assumed * LENS_MM, **how) for image in noisy]
 
 
@@ -61,6 +67,19 @@ def test_the_diameter_is_found(
     assert found.resolved
     assert found.lenses == pytest.approx(lenses, abs=3.0 * found.sigma_lenses)
     assert found.lenses == pytest.approx(lenses, rel=0.02, abs=0.01)
+
+
+@pytest.mark.thorough
+def test_the_diameter_is_found_where_light_is_few_photons(
+    table2: Camera, water: Media, rng: np.random.Generator
+) -> None:
+    camera = replace(table2, columns=260, rows=240)
+    tracers = rng.uniform((-0.5, -0.45, 0.5, 4e5), (0.5, 0.45, 2.0, 6e5), (14, 4))
+    # A twentieth of the photons that are taken to be usual until noise has been seen.
+    found = diameter_by(tasks_of(camera, water, [image_of(camera, water, tracers, 0.8)], rng, photons=0.025))
+    assert found is not None
+    assert found.tracers >= 4
+    assert found.lenses == pytest.approx(0.8, abs=2.0 * found.sigma_lenses)
 
 
 @pytest.mark.thorough

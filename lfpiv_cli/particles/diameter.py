@@ -37,6 +37,7 @@ from lfpiv_cli.particles.least_squares import (
     observation_of,
     room_for,
 )
+from lfpiv_cli.particles.noise import white_noise
 from lfpiv_cli.particles.rounds import (
     CANDIDATE_GAIN,
     ROUNDS,
@@ -100,7 +101,7 @@ ENOUGH, FEWEST_FRAMES, UNKNOWN_LENSES = 10, 2, 0.5
 # The share of the brightest tracers that must stand alone: of ten of forty that do so where six lie before each
 # microlens, the others are more, and what they lack made 0.72 microlenses of 0.5. Of up to 1.5 all do, of four none.
 ALONE_SHARE = 0.5
-# Only noise is left around a tracer whose chi-squared per pixel is at most this: 1 to 2.3 with the right size and the
+# Only noise is left around a tracer whose chi-squared per pixel is at most this: .6 to 2.3 with the right size and the
 # neighbours found, 4 to 500 where neighbours are missing.
 NOISE_ALONE = 3.0
 # By waves: squares of diffusion that are tried beside the best, px^2, and of the diameter, as a share and
@@ -235,7 +236,7 @@ def measured_sizes(task: Task, diameter: float | None = None) -> Sizes:
         found = accepted(task, _begun(task, state), sought.candidates.copy(), SEARCH[0])
         diameter = _tried(task, found, _steps(diameter, share), SEARCH[0].unexplained).diameter
     sizes = _settled_sizes(sought, diameter, SEARCH)
-    sizes = sizes if sizes.square.size else _settled_sizes(sought, *_least_misfit(sought))
+    sizes = sizes if sizes.square.size else _crowded_sizes(sought)
     return sizes._replace(candidates=len(candidates))
 
 
@@ -300,26 +301,30 @@ def _found(sought: Sought, diameter: float, rounds: Sequence[Round]) -> Found:
     return task, state
 
 
-def _least_misfit(sought: Sought) -> tuple[float, Sequence[Round], Found]:
-    """Return the diameter with which all rounds explain the image best, to half of `LADDER`: for crowded tracers.
+def _crowded_sizes(sought: Sought) -> Sizes:
+    """Return the sizes of crowded tracers, whose neighbours all rounds are needed for.
 
-    Along with these rounds and what they found with it. With a wrong diameter neighbours are not found, and chi-squared
-    is several times as large.
+    Of the diameter with which they explain the image best, to half of `LADDER`, where the unknown one does not lead
+    there by itself: with a wrong one neighbours are not found, and chi-squared is several times as large.
     """
 
     def trial(step: int) -> tuple[float, Found]:
-        task, state = _found(sought, UNKNOWN_LENSES * LADDER**step, ROUNDS)
+        task, state = first if step == 0 else _found(sought, UNKNOWN_LENSES * LADDER**step, ROUNDS)
         fits = judged(task, state, 0.0)
         bright = _bright(state, fits.seen)
         return float(np.median(fits.chi2[bright])) if bright.any() else np.inf, (task, state)
 
+    first = _found(sought, UNKNOWN_LENSES, ROUNDS)
+    sizes = _settled_sizes(sought, UNKNOWN_LENSES, ROUNDS, first)
+    if sizes.square.size:
+        return sizes
     best, (misfit, found) = 0, trial(0)
     for way in (-1, 1):
         while abs(best) < MOST_STEPS and (other := trial(best + way))[0] < misfit:
             best, (misfit, found) = best + way, other
         if best != 0:
             break
-    return UNKNOWN_LENSES * LADDER**best, ROUNDS, found
+    return sizes if best == 0 else _settled_sizes(sought, UNKNOWN_LENSES * LADDER**best, ROUNDS, found)
 
 
 def _settled_sizes(sought: Sought, diameter: float, rounds: Sequence[Round], first: Found | None = None) -> Sizes:
@@ -336,7 +341,9 @@ def _settled_sizes(sought: Sought, diameter: float, rounds: Sequence[Round], fir
         for share in NARROW:
             diameters = _steps(diameter, share)
             diameter, losses, alone = _tried(task, found, diameters, LAST_UNEXPLAINED)
-        if abs(diameter - searched_with) < max(NARROW[0] * searched_with, SMALLEST_STEP):
+        # Where neighbours are missing everywhere, what explains most of their light is no tracer's size.
+        settled = abs(diameter - searched_with) < max(NARROW[0] * searched_with, SMALLEST_STEP)
+        if settled or not alone.any():
             break
     if not _enough(alone):
         return NO_SIZES
@@ -474,7 +481,9 @@ def _tried(task: Task, state: State, diameters: NDArray[np.float64], unexplained
         sized = observed(_of_diameter(task, *trial), state, unexplained)._replace(residual=observation.residual)
         change[number], _ = _fitted(observation, sized, tracers, tracers[:, 2:3])
     losses = (change - change.min(axis=0)) / np.maximum(chi2[good], 1.0)
-    noise_alone, *_ = judge(observed(task, state, 0.0), tracers)
+    model, known = task.image - state.residual, replace(state.noise, read_counts=task.read_counts)
+    noise = white_noise(model, state.residual, task.usable, known, task.view.camera.columns)
+    noise_alone, *_ = judge(observed(task, replace(state, noise=noise), 0.0), tracers)
     return Trial(_common(trials[:, 0], losses), losses, noise_alone <= NOISE_ALONE)
 
 

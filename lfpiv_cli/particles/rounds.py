@@ -127,8 +127,8 @@ def finished(task: Task, state: State, settings: Round, checks: int = LAST_CHECK
             candidates = candidates[light > CANDIDATE_LIGHT * state.typical_light]
             state = accepted(task, state, candidates, replace(settings, unexplained=LAST_UNEXPLAINED))
             sweep(task, state, LAST_UNEXPLAINED, LAST_SWEEPS)
-        # What could not be split or moved may be now.
-        state = replace(state, unsplit=state.unsplit[:0], unmoved=state.unmoved[:0])
+        # What could not be split may be now; what could not be moved, with the noise that is measured first.
+        state = replace(state, unsplit=state.unsplit[:0], unmoved=state.unmoved if check else state.unmoved[:0])
         fits = judged(task, state, LAST_UNEXPLAINED)
         state = with_depths_corrected(task, state, fits.chi2, LAST_UNEXPLAINED)
         state = with_overlaps_split(task, state, fits.chi2, LAST_UNEXPLAINED, thorough=True)
