@@ -20,6 +20,7 @@ from lfpiv_cli.grid import Grid, Reference
 from lfpiv_cli.optics.camera import Camera, Lattice
 from lfpiv_cli.optics.media import Media, Window
 from tests.commands import CONFIG, SAMPLE, sample_weights
+from tests.written_files import WrittenFiles
 
 # Magnification, focal length, aperture; microlenses' focal length and distance, their lattice; pixel, columns, rows.
 TABLE2 = Camera(-1.0, 100.0, 25.0, 0.8, 0.8, Lattice.regular(0.1), 0.0055, 2352, 1768)
@@ -110,6 +111,12 @@ def pairs(tmp_path_factory: pytest.TempPathFactory):
     for path in paths:
         write_volume(path, rng.random((12, 12, 12)).astype(np.float32), grid, Reference("mid_plane", 0.0), **made)
     return paths
+
+
+@pytest.fixture(scope="session")
+def files(tmp_path_factory: pytest.TempPathFactory):
+    """The files of a chain on a small rig, each made where it is first asked for."""
+    return WrittenFiles(tmp_path_factory.mktemp("files"))
 
 
 @pytest.fixture(scope="session")

@@ -14,7 +14,7 @@ from lfpiv_cli.arrays import Floats
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.kernels import njit
 from lfpiv_cli.optics.media import Media
-from lfpiv_cli.simd import COEFFICIENTS, GROUP, LANES, TILE, combine_reference, combine_turned_reference, lanes_of
+from lfpiv_cli.simd import COEFFICIENTS, GROUP, LANES, TILE, combine_reference, lanes_of
 from lfpiv_cli.weights.build import factorise
 
 
@@ -85,34 +85,23 @@ def test_combine_equals_its_reference(rng, name, shape, onto, count, term_step, 
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("count", [0, 1, 3])
-def test_combine_turned_equals_its_reference(rng, count):
-    step = LANES + 3
-    source, share = rng.standard_normal(12 * step, np.float32), rng.standard_normal(4 * LANES, np.float32)
-    line = rng.integers(0, 8, LANES + 2).astype(np.int32)
-    expected, found = rng.standard_normal((2, step * LANES), np.float32)
-    found[:] = expected
-    places = ((2, step), source, line, (1, step, 2, count), share, LANES)
-    combine_turned_reference(expected, *places)
-    compiled("combine_turned", 7)(found, *places)
-    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6)
-
-
-@pytest.mark.thorough
-@pytest.mark.parametrize("count", [0, 1, 3])
-def test_sums_with_varying_shares_equal_their_references(rng, count):
+def test_turned_sums_and_those_with_varying_shares_equal_their_references(rng, count):
     step, places = LANES + 3, np.linspace(-1.0, 1.0, LANES + 5).astype(np.float32)
     source = rng.standard_normal(12 * step, np.float32)
     line = rng.integers(0, 8, LANES + 2).astype(np.int32)
     share = rng.standard_normal(4 * COEFFICIENTS * LANES, np.float32)  # of either sign: some weights are cut to 0
     expected = rng.standard_normal(step * LANES, np.float32)
     found = expected.copy()
-    arguments = source, line, (1, step, 2, count), share, LANES, places, 3
-    simd.combine_turned_varying_reference(expected, (2, step), *arguments)
-    compiled("combine_turned_varying", 9)(found, (2, step), *arguments)
-    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6)
-    simd.combine_varying_reference(expected, 7, *arguments)
-    compiled("combine_varying", 9)(found, 7, *arguments)
-    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6)
+    one = source, line, (1, step, 2, count), share, LANES
+    varying = *one, places, 3
+    for name, onto, arguments in (
+        ("combine_turned", (2, step), one),
+        ("combine_turned_varying", (2, step), varying),
+        ("combine_varying", 7, varying),
+    ):
+        getattr(simd, f"{name}_reference")(expected, onto, *arguments)
+        compiled(name, 2 + len(arguments))(found, onto, *arguments)
+        np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6)
 
 
 def test_turn_equals_its_reference_in_lanes_of_the_processor(rng):

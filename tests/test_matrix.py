@@ -213,12 +213,6 @@ def faults(files: WrittenFiles, name: str, kinds: Iterable[str] = (*KINDS, *NO_F
     return {kind: got for kind, got in found.items() if got not in wanted(PLACES[name], kind)}
 
 
-@pytest.fixture(scope="module")
-def files(tmp_path_factory: pytest.TempPathFactory) -> WrittenFiles:
-    """The files of the chain."""
-    return WrittenFiles(tmp_path_factory.mktemp("files"))
-
-
 def test_each_place_for_a_file_has_its_line() -> None:
     places = set()
     for command in COMMANDS:

@@ -45,12 +45,6 @@ OPENED = {
 DERIVED = ("vorticity", "divergence", "strain_rate", "q_criterion")
 
 
-@pytest.fixture(scope="module")
-def files(tmp_path_factory: pytest.TempPathFactory) -> WrittenFiles:
-    """The files of a chain on a small rig."""
-    return WrittenFiles(tmp_path_factory.mktemp("files"))
-
-
 def inside(path: Path, *left_out: str) -> dict[str, Any]:
     """Return all datasets and attributes of a file, but for what HDF5 keeps itself and the sums over attributes."""
     found: dict[str, Any] = {}

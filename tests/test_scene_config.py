@@ -33,16 +33,9 @@ from lfpiv_cli.weights.build import factorise, scene_distortion
 from lfpiv_cli.weights.model import Weights
 from tests.commands import ROOT, WATER
 from tests.known_rays import points_counted
+from tests.test_config import RIG as WITHOUT_BOARD
 
-RIG = """\
-camera:
-  main_lens: {magnification: -1.0, focal_length_mm: 100.0, aperture_mm: 25.0}
-  microlenses: {focal_length_mm: 0.8, pitch_mm: 0.1, layout: square}
-  sensor: {pixel_um: 5.5, columns: 235, rows: 177}
-media: {air: 1.0, window: 1.49, fluid: 1.33}
-volume: {shape_xyz: [8, 6, 4], voxel_mm: 0.1}
-board: {dots: [7, 7], spacing_mm: 1.0, dot_diameter_mm: 0.2, medium: fluid}
-"""
+RIG = WITHOUT_BOARD + "board: {dots: [7, 7], spacing_mm: 1.0, dot_diameter_mm: 0.2, medium: fluid}\n"
 TUBE = """\
 scene:
   - {kind: cylinder, axis: x, radius_mm: 7.0, centre_mm: [0, 0, 0], behind: window}
@@ -169,7 +162,7 @@ def test_without_a_scene_layers_are_plane_and_weights_are_made_through_one(confi
     with pytest.raises(ConfigError, match="scene: has 0 entries, expected 1"):
         configured(RIG + "scene: []")
     with pytest.raises(ConfigError, match="scene: needs the section media"):
-        configured(RIG.replace("media: {air: 1.0, window: 1.49, fluid: 1.33}", "") + TUBE)
+        configured(RIG.replace("media:  {air: 1.0, window: 1.49, fluid: 1.33}", "") + TUBE)
 
 
 @pytest.mark.parametrize(
