@@ -18,6 +18,7 @@ from lfpiv_cli.optics.waves import Waves
 from lfpiv_cli.particles.joining import boxes_of, explain_rest, find_peaks
 from lfpiv_cli.particles.rounds import ROUNDS, find_particles, first_pass, first_typical_light
 from lfpiv_cli.particles.search import noise_with
+from lfpiv_cli.particles.view import lens_pixels
 from lfpiv_cli.reconstruction.solvers import normalisers
 from lfpiv_cli.synthetic.render import Balls, render_points
 from lfpiv_cli.validation.volume import particle_figures
@@ -112,6 +113,16 @@ def test_a_single_tracer_is_found_in_a_volume_partly_out_of_view(table2: Camera,
     image = np.rint(with_noise(seen_by(camera, water, true, (1.0, 3.0)), rng))
     state = first_pass(task_for(image, camera, water, grid_of((24, 24, 7), 1.9)), ROUNDS[:1])
     np.testing.assert_allclose(state.particles, true, rtol=0.02, atol=2e-3)
+
+
+def test_light_that_may_be_haze_is_no_particle(table2: Camera, water: Media, rng: np.random.Generator) -> None:
+    camera, true = replace(table2, columns=160, rows=160), np.array([[0.05, -0.1, 1.8, 5e5], [-0.2, 0.15, 1.5, 2.5e5]])
+    image = with_noise(seen_by(camera, water, true, (1.0, 3.0)), rng)
+    task = task_for(image, camera, water, grid_of((10, 10, 7), 1.9))
+    for share, found in ((0.0, 2), (0.4, 2), (0.6, 1)):
+        # In pixels of the fainter one, which is as bright as 2 standard errors are of half a one.
+        error = np.full(image.size, share * 2.5e5 / lens_pixels(task.view))
+        assert len(first_pass(replace(task, haze_error=error), ROUNDS[:1]).particles) == found
 
 
 def with_noise(light: Floats, rng: np.random.Generator) -> Floats:

@@ -154,7 +154,8 @@ def explained(task: Task, state: State, candidates: Floats, settings: Round) -> 
 
 def with_candidates(task: Task, state: State, candidates: Floats, light: Floats) -> tuple[State, Floats]:
     """Return the state with its typical light, by candidates where no particle is known, and those to be tried."""
-    typical = state.typical_light
+    typical, bright = state.typical_light, light > task.least_light
+    candidates, light = candidates[bright], light[bright]
     if typical == 0.0:
         # Where hardly any light meets the sensor, at the volume's rim, noise becomes peaks brighter than tracers.
         *_, seen = judge(observed(task, state, LAST_UNEXPLAINED), candidates)

@@ -82,6 +82,9 @@ def disturbance(overlaps: Overlaps, gain: Floats) -> Floats:
 LAST_SWEEPS, LAST_UNEXPLAINED = 4, 0.02
 # Share of a typical particle's light that a particle must have.
 SMALLEST_LIGHT = 0.3
+# In its pixels a particle is brighter than haze may still be by this many of its standard errors: of 0.2 counts left in
+# a 10-bit image one was found five microlenses wide.
+HAZE_SIGMAS = 2.0
 # A particle stays while at least this much of it meets the sensor.
 SMALLEST_SEEN = 0.1
 # A good particle's chi-squared is the one at this percentile.
@@ -175,6 +178,12 @@ class Task:
     def light(self) -> Floats:
         """The tracers' light (rows * columns,): the image without haze."""
         return self.image if self.haze is None else self.image - self.haze
+
+    @cached_property
+    def least_light(self) -> float:
+        """The light (counts) below which a particle may be haze that was not taken off; 0 where nothing is known."""
+        error = 0.0 if self.haze_error is None else float(self.haze_error.max())
+        return HAZE_SIGMAS * error * lens_pixels(self.view)
 
     @cached_property
     def read_counts(self) -> float:
@@ -332,7 +341,8 @@ def prune(task: Task, state: State, claimed_share: float, unexplained: float) ->
     And how well those that stay fitted beside them.
     """
     fits = judged(task, state, unexplained)
-    keep = (state.particles[:, 3] > SMALLEST_LIGHT * state.typical_light) & (fits.seen > SMALLEST_SEEN)
+    least = max(SMALLEST_LIGHT * state.typical_light, task.least_light)
+    keep = (state.particles[:, 3] > least) & (fits.seen > SMALLEST_SEEN)
     keep &= fits.share > claimed_share
     return kept(task, state, keep), fits.of(keep)
 
