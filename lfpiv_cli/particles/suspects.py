@@ -137,7 +137,7 @@ def _split(
 # Starts relative to the particle's depth, in depths over which light spreads by one lens (Table 2: 0.2 to 2 mm); its
 # mirrored depth is another.
 OTHER_DEPTHS = np.array([-2.0, -1.5, -1.0, -0.7, -0.4, -0.2, 0.2, 0.4, 0.7, 1.0, 1.5, 2.0]) / 1.064
-STEPS = 8
+STEPS = 14
 
 
 def try_other_depths(
