@@ -396,7 +396,7 @@ def test_an_output_that_kills_workers_is_named_and_the_others_are_made(tmp_path:
 
 
 class Ending(Toy):
-    """Ends the scheduler, whose process is told in a file, with its last output."""
+    """Ends the scheduler, whose process is named in a file, with its last output."""
 
     def make(self, number: int, work: Frames) -> int:
         if number == len(self.targets) - 1:
@@ -408,7 +408,7 @@ class Ending(Toy):
 def test_workers_elsewhere_and_a_scheduler_that_ends(tmp_path: Path) -> None:
     tests = Path(__file__).parent
     environment = os.environ | {"PYTHONPATH": f"{tests.parent}{os.pathsep}{tests}"}
-    reported = ["--scheduler-file", str(tmp_path / "told.json")]
+    reported = ["--scheduler-file", str(tmp_path / "scheduler.json")]
     with contextlib.ExitStack() as processes:
 
         def start(module: str, *options: str) -> int:
@@ -420,9 +420,9 @@ def test_workers_elsewhere_and_a_scheduler_that_ends(tmp_path: Path) -> None:
 
         scheduler = start("dask_scheduler", "--port", "0", "--no-dashboard")
         start("dask_worker", "--nthreads", "1", "--no-nanny", "--no-dashboard", "--local-directory", str(tmp_path))
-        while not (tmp_path / "told.json").exists():
+        while not (tmp_path / "scheduler.json").exists():
             time.sleep(0.1)
-        address = json.loads((tmp_path / "told.json").read_text())["address"]
+        address = json.loads((tmp_path / "scheduler.json").read_text())["address"]
         worked, _ = work(Toy(tmp_path, 3), address)
         assert list(worked.outcomes) == [0, 1, 2]
         assert os.getpid() not in worked.outcomes.values()

@@ -406,7 +406,7 @@ def test_uncertainties_that_are_too_small_are_found_out(pair: tuple[VectorField,
     sharp = stated_field(truth() + 0.05 * (second.displacement_voxel - truth()), 0.05 * second.uncertainty_voxel)
     noisy = stated_field(truth() + 3.0 * (first.displacement_voxel - truth()), first.uncertainty_voxel)
     found = combine(noisy, sharp)
-    # Depth by depth the noise is another; of 1,320 differences a median tells the factor to 4 %.
+    # Depth by depth the noise is another; of 1,320 differences a median shows the factor to 4 %.
     np.testing.assert_allclose(found.widened, [[3.0] * 3, [1.0] * 3], rtol=0.15)
 
 

@@ -37,7 +37,7 @@ from lfpiv_cli.particles.least_squares import (
     observation_of,
     room_for,
 )
-from lfpiv_cli.particles.noise import white_noise
+from lfpiv_cli.particles.noise import beside_neighbours
 from lfpiv_cli.particles.rounds import (
     CANDIDATE_GAIN,
     ROUNDS,
@@ -57,6 +57,7 @@ from lfpiv_cli.particles.search import (
     observed,
     rebuilt,
     sweep,
+    with_measured_noise,
     with_typical_light,
 )
 from lfpiv_cli.particles.view import by_waves, footprint_radius_mm, on_array_mm, over_tiles, with_radius
@@ -481,9 +482,8 @@ def _tried(task: Task, state: State, diameters: NDArray[np.float64], unexplained
         sized = observed(_of_diameter(task, *trial), state, unexplained)._replace(residual=observation.residual)
         change[number], _ = _fitted(observation, sized, tracers, tracers[:, 2:3])
     losses = (change - change.min(axis=0)) / np.maximum(chi2[good], 1.0)
-    model, known = task.image - state.residual, replace(state.noise, read_counts=task.read_counts)
-    noise = white_noise(model, state.residual, task.usable, known, task.view.camera.columns)
-    noise_alone, *_ = judge(observed(task, replace(state, noise=noise), 0.0), tracers)
+    noisy = with_measured_noise(task, state, beside_neighbours(state.residual, task.view.camera.columns))
+    noise_alone, *_ = judge(observed(task, noisy, 0.0), tracers)
     return Trial(_common(trials[:, 0], losses), losses, noise_alone <= NOISE_ALONE)
 
 

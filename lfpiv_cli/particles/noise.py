@@ -165,15 +165,15 @@ def measured_noise(model: Floats, residual: Floats, usable: NDArray[np.bool_], n
     return Noise(noise.read_counts, float(gain), float(np.sqrt(error2)))
 
 
-def white_noise(model: Floats, residual: Floats, usable: NDArray[np.bool_], noise: Noise, columns: int) -> Noise:
-    """Return `measured_noise` by what pixels have beside the mean of both their neighbours in a row of `columns`.
+def beside_neighbours(residual: Floats, columns: int) -> Floats:
+    """Return what pixels (rows * columns,) have beside the mean of both neighbours in their row, as large as noise is.
 
     Light that was not found is nearly alike in them, and noise is not.
     """
     left = residual.reshape(-1, columns)
     beside = np.zeros_like(left)
     beside[:, 1:-1] = (2.0 * left[:, 1:-1] - left[:, :-2] - left[:, 2:]) / np.sqrt(6.0)
-    return measured_noise(model, beside.ravel(), usable, noise)
+    return beside.ravel()
 
 
 def read_noise(image: Floats) -> float:

@@ -377,10 +377,11 @@ def with_typical_light(task: Task, state: State, fits: Fits) -> State:
     return replace(state, typical_light=typical, noise=noise_with(task, typical))
 
 
-def with_measured_noise(task: Task, state: State) -> State:
-    """Return the state with the noise that its particles leave of the image."""
+def with_measured_noise(task: Task, state: State, left: Floats | None = None) -> State:
+    """Return the state with the noise that its particles leave of the image, or as it is `left` (pixels,) of it."""
     assumed = replace(state.noise, read_counts=task.read_counts)
-    return replace(state, noise=measured_noise(task.image - state.residual, state.residual, task.usable, assumed))
+    residual = state.residual if left is None else left
+    return replace(state, noise=measured_noise(task.image - state.residual, residual, task.usable, assumed))
 
 
 def usual_chi2(chi2: Floats) -> float:
