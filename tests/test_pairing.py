@@ -436,6 +436,11 @@ def test_results_are_in_order_and_errors_come_through() -> None:
     assert in_threads(lambda k: 10 // k, [1, 2, 5]) == [10, 5, 2]
     with pytest.raises(ZeroDivisionError):
         in_threads(lambda k: 10 // k, [1, 0, 5])
+    with pytest.raises(ZeroDivisionError):
+        in_threads(lambda k: 10 // k, [0, 1, 5], [set(), {0}, {1}])
+    done: list[int] = []
+    in_threads(lambda k: (sleep(0.02 * (k == 0)), done.append(k)), range(4), [set(), {0}, set(), {1}])
+    assert (done.index(0) < done.index(1) < done.index(3), done[0]) == (True, 2)
     sums = in_threads(lambda row: sum(in_threads(lambda k: row * k, range(5))), range(5))
     assert sums == [10 * row for row in range(5)]
 

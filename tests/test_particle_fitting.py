@@ -2,6 +2,7 @@
 
 from contextlib import nullcontext
 from dataclasses import replace
+from itertools import combinations
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from lfpiv_cli.particles.fitting import Least, accept, claimed_share, judge, ref
 from lfpiv_cli.particles.least_squares import Observation, normal_equations, observation_of
 from lfpiv_cli.particles.noise import WHITE, Correlation, Noise, error_correlation, measured_noise
 from lfpiv_cli.particles.suspects import split, try_other_depths
-from lfpiv_cli.particles.view import Light, View, entry_capacity, groups_of_tiles, raw_view, with_radius
+from lfpiv_cli.particles.view import Light, View, entry_capacity, raw_view, tiles_of, with_radius
 from lfpiv_cli.self_calibration.nuisances import Nuisances, fit_nuisances
 from tests.particle_images import light_on
 from tests.particle_twin import respond_once
@@ -260,12 +261,13 @@ def test_a_particle_at_a_wrong_depth_finds_its_own(view: View, wrong: float) -> 
 @pytest.mark.thorough
 def test_tiles_share_no_pixel_whatever_the_threads(view: View, rng: np.random.Generator, one_thread) -> None:
     particles = scattered(80, rng)
-    groups = groups_of_tiles(view, particles, DEPTHS)
-    tiles = [numbers for group in groups for numbers in group]
+    tiles, after = tiles_of(view, particles, DEPTHS)
     assert sorted(np.concatenate(tiles).tolist()) == list(range(80))
-    assert (len(tiles) > 4, len(groups)) == (True, 4)
-    for group in groups:
-        assert sum(image_of(view, particles[numbers]) > 0.0 for numbers in group).max() <= 1.0
+    assert len(tiles) > 4
+    lit = [image_of(view, particles[numbers]) > 0.0 for numbers in tiles]
+    for one, other in combinations(range(len(tiles)), 2):
+        assert one in after[other] or not np.any(lit[one] & lit[other])
+    assert all(before < number for number, each in enumerate(after) for before in each)
     particles = scattered(60, rng)
     image = image_of(view, particles)
     start = particles + rng.normal(0.0, (0.01, 0.01, 0.05, 2e4), particles.shape)

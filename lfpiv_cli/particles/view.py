@@ -347,8 +347,8 @@ def entry_capacity(view: View, z_low_mm: float, z_high_mm: float) -> int:
 # Particles by tiles of the image, so that threads work on them at once and their number does not matter.
 #
 # The image is cut into square tiles at least as wide as two footprints. Tiles whose numbers are even along both axes
-# form one group, and so on: four groups. Particles of different tiles of one group light no common pixel, so a
-# group's tiles can be worked on at once; within a tile particles follow each other.
+# form one group, and so on: four groups. Particles of tiles that do not touch, as those of one group, light no common
+# pixel and can be worked on at once; tiles that touch follow each other as their groups do, and particles of a tile.
 
 
 # How far a particle may be moved within one sweep, in microlenses: footprints must not grow into other tiles.
@@ -358,28 +358,30 @@ LARGEST_MOVE_LENSES = 1.5
 def over_tiles(
     work: Callable[[NDArray[np.int64]], None], view: View, points: Floats, depths_mm: tuple[float, float]
 ) -> None:
-    """Call work(numbers) with the particles of each tile, in their order, on all threads: one group after another.
+    """Call work(numbers) with the particles of each tile, in their order, on all threads.
 
     Parameters
     ----------
     points : (n, 3 or more), image axes
     depths_mm : between which particles stay
     """
-    for tiles in groups_of_tiles(view, points, depths_mm):
-        in_threads(work, tiles)
+    in_threads(work, *tiles_of(view, points, depths_mm))
 
 
-def groups_of_tiles(view: View, points: Floats, depths_mm: tuple[float, float]) -> list[list[NDArray[np.int64]]]:
-    """Return the numbers of the particles of each tile, for the four groups of tiles."""
+def tiles_of(
+    view: View, points: Floats, depths_mm: tuple[float, float]
+) -> tuple[list[NDArray[np.int64]], list[set[int]]]:
+    """Return the numbers of the particles of each tile, and of each the tiles that must be done before it.
+
+    Tiles of one of four groups never touch; of those that do the one of the earlier group is the first.
+    """
     tile = np.floor(on_array_mm(view, points) / tile_side_mm(view, *depths_mm)).astype(np.int64)
-    group = tile[:, 0] % 2 + 2 * (tile[:, 1] % 2)
-    groups = []
-    for number in range(4):
-        members = np.flatnonzero(group == number)
-        members = members[np.lexsort((members, tile[members, 0], tile[members, 1]))]
-        ends = np.flatnonzero(np.any(np.diff(tile[members], axis=0) != 0, axis=1)) + 1
-        groups.append([numbers for numbers in np.split(members, ends) if numbers.size])
-    return groups
+    placed = np.column_stack([tile[:, 0] % 2 + 2 * (tile[:, 1] % 2), tile[:, ::-1]])
+    order = np.lexsort(placed.T[::-1])
+    begins = np.flatnonzero(np.any(np.diff(placed[order], axis=0, prepend=-1) != 0, axis=1))
+    at = placed[order[begins], 1:]
+    touching = np.abs(at[:, np.newaxis] - at).max(axis=-1) <= 1
+    return np.split(order, begins)[1:], [set(np.flatnonzero(row[:n])) for n, row in enumerate(touching)]
 
 
 def tile_side_mm(view: View, z_low_mm: float, z_high_mm: float) -> float:
