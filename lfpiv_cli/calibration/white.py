@@ -242,7 +242,8 @@ def vignetting_surface(coefficients: Floats, shape: tuple[int, int]) -> Singles:
     x and y run from -1 to 1 over the columns and the rows.
     """
     y, x = ((np.arange(n) - n / 2.0) / (n / 2.0) for n in shape)
-    surface = np.polynomial.polynomial.polygrid2d(y, x, coefficients)
+    rows, columns = coefficients.shape
+    surface = np.vander(y, rows, increasing=True) @ coefficients @ np.vander(x, columns, increasing=True).T
     return np.clip(surface, TRANSMISSION_FLOOR, 1.0 / TRANSMISSION_FLOOR).astype(np.float32)
 
 

@@ -83,13 +83,13 @@ class Lattice:
         Rounding the oblique coordinates is right on squares and names the wrong neighbour for one point in six on
         hexagons, so the neighbours are compared.
         """
-        points = np.asarray(points, dtype=np.float64)
         rounded = np.rint(self.coordinates(points)).astype(np.int64)
         steps = np.array([(i, j) for i in (0, -1, 1) for j in (0, -1, 1)])
-        candidates = rounded[..., np.newaxis, :] + steps
-        distance2 = np.sum((self.points(candidates) - points[..., np.newaxis, :]) ** 2, axis=-1)
-        best = np.argmin(distance2, axis=-1)
-        return np.take_along_axis(candidates, best[..., np.newaxis, np.newaxis], axis=-2)[..., 0, :]
+        ways = steps @ self.basis
+        off = np.asarray(points, dtype=np.float64) - self.points(rounded)
+        # What a neighbour's squared distance is more by than that of the rounded one.
+        more = np.sum(ways**2, axis=-1) - 2.0 * off @ ways.T
+        return rounded + steps[np.argmin(more, axis=-1)]
 
     def scaled(self, factor: float) -> Lattice:
         """Return the lattice with all lengths multiplied by `factor` about the coordinate origin."""
