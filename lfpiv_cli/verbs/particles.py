@@ -30,6 +30,7 @@ from lfpiv_cli.particles.camera_light import FocalLength, focal_length_of
 from lfpiv_cli.particles.counting import tracers_per_lens as counted
 from lfpiv_cli.particles.diameter import ENOUGH, UNKNOWN_LENSES, diameter_by
 from lfpiv_cli.particles.neighbour_frames import second_frame, second_pass
+from lfpiv_cli.particles.noise import beside_neighbours
 from lfpiv_cli.particles.rounds import ROUNDS, first_pass
 from lfpiv_cli.particles.search import LAST_UNEXPLAINED, MARGIN_DEPTHS, MUCH_LEFT, Particles, Task, result, task_of
 from lfpiv_cli.particles.view import Light, View, ensure_square_cells, raw_view
@@ -293,7 +294,8 @@ def points_of(bench: Bench, frame: Frame, found: Particles, size: TracerSize, pr
     left_rms = float(np.sqrt(np.mean(left[~frame.unusable] ** 2)))
     noise = found.noise.of_dark(None if haze is None else haze.image[~frame.unusable].astype(np.float64))
     # Of four tracers for each microlens only 1.3 are found, and few of them are right. What noise leaves is no light.
-    crowded = share_left**2 * max(left_rms**2 - noise**2, 0.0) > (MUCH_LEFT * left_rms) ** 2
+    beside = beside_neighbours(left, left.shape[1])[~frame.unusable.ravel()]
+    crowded = share_left**2 * max(left_rms**2 - float(np.mean(beside**2)), 0.0) > (MUCH_LEFT * left_rms) ** 2
     number = tracers_per_lens(bench, frame) if crowded else None
     focus = _focal_length(bench, frame, found)
     return Points(
