@@ -78,8 +78,9 @@ class Scratch(NamedTuple):
 PLACE, TWIN = (0, 2), (1, 3)
 ENTRY, LOW = 4, 5
 # Lenses share profiles where that moves a profile by less than this share of the ball's radius: at second order up to
-# 3e-3 of the light is elsewhere then, which moves places by 30 nm.
-SHARED = 0.05
+# 3e-3 of the light is elsewhere then, which moves places by 30 nm. What bent rays move profiles by is alike in all
+# lenses of a column or a row, but for a third of it.
+SHARED, BENT_UNLIKE = 0.05, 1.0 / 3.0
 # Numbers that are no part of a type: for plain ones `_line_up` is compiled once each.
 AXES = np.int64(0), np.int64(1)
 
@@ -174,8 +175,8 @@ def _shared(view: View, projection: Projection, bend: Bend, i: int, j: int) -> t
     i, j = min(i, centres.shape[1] - 2), min(j, centres.shape[0] - 2)
     drift = max(abs(centres[j + 1, i, 0] - centres[j, i, 0]), abs(centres[j, i + 1, 1] - centres[j, i, 1]))
     bent = view.camera.image_distance_mm * largest_displacement(bend, view.camera.aperture_radius_mm)
-    within = SHARED * min(x.radius, y.radius)
-    if bent > within:
+    within = SHARED * min(x.radius, y.radius) - BENT_UNLIKE * bent
+    if within < 0.0:
         return 1, 0.0
     # Pixels of one lens along a line at most.
     lit = 2
