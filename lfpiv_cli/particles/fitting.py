@@ -33,7 +33,6 @@ from lfpiv_cli.particles.least_squares import (
     copy_rows,
     fit,
     lit_by,
-    prior_chi2,
     respond_of,
     room_for,
 )
@@ -290,8 +289,8 @@ def _fit_again(
         observation.respond(view, best, responses)
         pixels, values = lit_by(responses, 0)
         add_light(pixels, values, best[0, 3], residual)
-        before = change_by(pixels, values, best[0, 3], residual, observation.weight) + prior_chi2(best, expected)
         after = fit_one(observation, best, expected, responses, effort)
+        before = responses.began[0]
         if depths.shape[1] > 0:
             lowest = after - elsewhere.gain
             begin_at(view, particles[number], depths[number], starts)

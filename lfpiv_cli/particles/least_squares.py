@@ -55,6 +55,7 @@ class Responses(NamedTuple):
         find common pixels
     common : (2, 4, capacity) where there are two particles, room for what both do to common pixels
     picked : (2, capacity), room for the residual and the weights of the pixels of one of them
+    began : (1,) what particles added to chi-squared where the last fit began
     scratch : room for what lenses show
     """
 
@@ -64,6 +65,7 @@ class Responses(NamedTuple):
     place: NDArray[np.int32]
     common: Floats
     picked: Floats
+    began: Floats
     scratch: Scratch
 
 
@@ -118,8 +120,8 @@ def room_for(members: int, capacity: int, places: int) -> Responses:
     room = capacity + SLACK
     pixels, values = np.empty((members, room), np.int32), np.empty((members, VALUES, room), np.float32)
     common = np.empty((2, UNKNOWNS, room if members == 2 else 0))
-    place, picked = np.zeros(places, np.int32), np.empty((2, room))
-    return Responses(np.zeros(members, np.int64), pixels, values, place, common, picked, scratch(capacity))
+    place, picked, began = np.zeros(places, np.int32), np.empty((2, room)), np.zeros(1)
+    return Responses(np.zeros(members, np.int64), pixels, values, place, common, picked, began, scratch(capacity))
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
@@ -300,13 +302,14 @@ def fit(observation: Observation, members: Floats, prior: Floats, responses: Res
     Parameters
     ----------
     prior : (k, 8) values and weights 1/sigma^2 of what is expected of them; weights of 0: nothing is
-    responses : of the particles, on entry as on return
+    responses : of the particles, on entry as on return; says on return where the fit began
     """
     n = UNKNOWNS * members.shape[0]
     matrix, trial_matrix, lower = np.empty((n, n)), np.empty((n, n)), np.empty((n, n))
     right, trial_right = np.empty(n), np.empty(n)
     step, trial, begin = np.zeros(n), np.empty_like(members), members.copy()
     change = _equations(observation, members, prior, responses, matrix, right)
+    responses.began[0] = change
     damping, last_failed = DAMPING, False
     for _ in range(effort.steps):
         if not factored(matrix, damping, lower):
