@@ -6,6 +6,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import brentq
+from scipy.special import ndtr
 
 from lfpiv_cli.arrays import Floats
 
@@ -47,3 +49,32 @@ def weighted_median(values: Floats, sigma: Floats) -> tuple[float, float]:
     each = 1.0 / np.sqrt(np.mean(1.0 / sigma**2))
     common = scatter < LEAST_SCATTER * each
     return middle, float(max(scattered, each if common else each / np.sqrt(values.size)))
+
+
+def number_below(values: NDArray[np.floating]) -> tuple[Floats, Floats]:
+    """Return the edges between whole counts (k + 1,), ascending, and how many of values (n,) are below each.
+
+    Whole counts are what was rounded to them: of little noise their percentiles are steps, and a normal distribution
+    has as many below the edges between them. Below the lowest edge none was seen: half of one.
+    """
+    counts, number = np.unique(values.astype(np.float64), return_counts=True)
+    step = float(np.diff(counts).min()) if counts.size > 1 else 0.0
+    edges = np.append(counts[0] - 0.5 * step, counts + 0.5 * step)
+    return edges, np.concatenate([[0.5], np.cumsum(number)])
+
+
+def spread_below_zero(values: NDArray[np.floating]) -> float:
+    """Return the standard deviation of noise about zero by the values (n,) below it, where no light hides it.
+
+    By where those below the last edge between counts that is below zero are halved, and with what rounding adds; 0
+    where there are none.
+    """
+    dark = values[values <= 0.0]
+    edges, below = number_below(dark) if dark.size else (np.zeros(1), np.zeros(1))
+    last = int(np.searchsorted(edges, 0.0, side="right")) - 1
+    half = int(np.searchsorted(below, 0.5 * below[last], side="right")) - 1
+    if last < 1 or edges[half] == edges[last]:
+        return 0.0
+    near, far, share = float(edges[last]), float(edges[half]), float(below[half] / below[last])
+    spread = brentq(lambda sigma: ndtr(far / sigma) / ndtr(near / sigma) - share, -0.05 * far, -2.0 * far)
+    return float(np.hypot(spread, (edges[1] - edges[0]) / np.sqrt(12.0)))

@@ -14,7 +14,15 @@ from lfpiv_cli.optics.media import Media
 from lfpiv_cli.particles.covariance import joint_covariance
 from lfpiv_cli.particles.fitting import Least, accept, claimed_share, judge, refine
 from lfpiv_cli.particles.least_squares import Observation, normal_equations, observation_of
-from lfpiv_cli.particles.noise import WHITE, Correlation, Noise, error_correlation, measured_noise
+from lfpiv_cli.particles.noise import (
+    ROUNDING_COUNTS,
+    WHITE,
+    Correlation,
+    Noise,
+    error_correlation,
+    measured_noise,
+    read_noise,
+)
 from lfpiv_cli.particles.suspects import split, try_other_depths
 from lfpiv_cli.particles.view import Light, View, entry_capacity, raw_view, tiles_of, with_radius
 from lfpiv_cli.self_calibration.nuisances import Nuisances, fit_nuisances
@@ -312,6 +320,13 @@ def test_correlation_is_read_off_what_is_left(rng: np.random.Generator) -> None:
     white = error_correlation(lit, rng.normal(size=error.shape), np.ones(error.shape), noise)
     assert white.share < 0.02
     assert error_correlation(lit, 9.0 * error, np.zeros(error.shape), noise) == WHITE
+
+
+@pytest.mark.parametrize("spread", [0.4, 0.7, 2.0, 6.3])
+def test_read_noise_of_whole_counts_is_that_of_what_was_rounded(rng: np.random.Generator, spread: float) -> None:
+    counts = rng.normal(0.0, spread, 50_000)
+    counts[::2] += rng.exponential(20.0 * spread, 25_000)
+    assert read_noise(np.rint(counts)) == pytest.approx(np.hypot(spread, ROUNDING_COUNTS), rel=0.06)
 
 
 @pytest.mark.thorough

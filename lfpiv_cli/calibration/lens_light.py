@@ -27,6 +27,7 @@ from lfpiv_cli.calibration.lattice import LatticeFit
 from lfpiv_cli.calibration.rectification import Rectification
 from lfpiv_cli.kernels import njit
 from lfpiv_cli.optics.camera import Lattice
+from lfpiv_cli.robust import number_below
 from lfpiv_cli.threads import share_out
 
 # Parts of a picture along each side.
@@ -241,12 +242,8 @@ def dark_level(pixels: NDArray[np.floating]) -> tuple[float, float]:
     known = pixels[np.isfinite(pixels)]
     if not known.size:
         return 0.0, 0.0
-    # Whole counts are what was rounded to them: of little noise their percentiles are steps, and a normal distribution
-    # has as many below the edges between them.
-    values, number = np.unique(known, return_counts=True)
-    step = float(np.diff(values).min()) if values.size > 1 else 0.0
-    below = np.concatenate([[0.5], np.minimum(np.cumsum(number), known.size - 0.5)]) / known.size
-    two, one = np.interp((-2.0, -1.0), ndtri(below), np.append(values[0] - 0.5 * step, values + 0.5 * step))
+    edges, below = number_below(known)
+    two, one = np.interp((-2.0, -1.0), ndtri(np.minimum(below, known.size - 0.5) / known.size), edges)
     return float(2.0 * one - two), float(one - two)
 
 

@@ -15,7 +15,7 @@ from scipy.optimize import nnls
 
 from lfpiv_cli.arrays import Floats
 from lfpiv_cli.kernels import COUNT_NO_REFERENCES, njit
-from lfpiv_cli.robust import HALF_NORMAL_MEDIAN
+from lfpiv_cli.robust import HALF_NORMAL_MEDIAN, spread_below_zero
 from lfpiv_cli.threads import share_out
 
 # The optics model of a pixel's light is trusted to this share until what it leaves has been seen.
@@ -185,8 +185,7 @@ def read_noise(image: Floats) -> float:
     Where pixels below a threshold were set to zero, as by who removes noise, most are zero and the faintest of the
     others shows the threshold: up to there zero says nothing.
     """
-    below = image[image < 0.0]
-    read = float(np.median(-below)) / HALF_NORMAL_MEDIAN if below.size else 0.0
+    read = spread_below_zero(image)
     lit = image[image > 0.0]
     if 0 < lit.size < np.count_nonzero(image == 0.0):
         read = max(read, (float(lit.min()) - 0.5) / np.sqrt(3.0))

@@ -14,7 +14,7 @@ import numpy as np
 
 from lfpiv_cli.arrays import Flags, Floats, Singles
 from lfpiv_cli.errors import InputError
-from lfpiv_cli.robust import BRIGHTEST_PERCENTILE, HALF_NORMAL_MEDIAN, MAD_TO_SIGMA
+from lfpiv_cli.robust import BRIGHTEST_PERCENTILE, MAD_TO_SIGMA, spread_below_zero
 
 Image = Singles
 Mask = Flags
@@ -183,7 +183,6 @@ def noise_residual(image: Image, photons_per_count: float | None = None) -> floa
     """
     lit = np.maximum(image, 0.0).astype(np.float64)
     norm = float(np.sqrt(np.sum(lit**2)))
-    below = image[image < 0.0]
-    read = float(np.median(-below)) / HALF_NORMAL_MEDIAN if below.size else 0.0
+    read = spread_below_zero(image)
     shot = float(np.sum(lit)) / photons_per_count if photons_per_count is not None else 0.0
     return float(np.sqrt(read**2 * image.size + shot)) / norm if norm > 0.0 else 0.0

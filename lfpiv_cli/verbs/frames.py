@@ -35,7 +35,7 @@ from lfpiv_cli.reconstruction import images as of_images
 from lfpiv_cli.reconstruction.haze import Haze, white_of
 from lfpiv_cli.reconstruction.images import Image, Mask
 from lfpiv_cli.reconstruction.solvers import Normalisers, Operator, normalisers
-from lfpiv_cli.robust import HALF_NORMAL_MEDIAN, MAD_TO_SIGMA
+from lfpiv_cli.robust import MAD_TO_SIGMA, spread_below_zero
 
 # Beyond so much the two are not the same.
 CONTRADICTING_SHARE = 0.01
@@ -341,12 +341,12 @@ def frame_notices(bench: Bench, raw: Image, lit: Image, name: str) -> list[Notic
     # one pixel to the next.
     counts = seen[np.isfinite(seen)]
     steps = np.concatenate([np.diff(seen, axis=axis).ravel() for axis in (0, 1)])
-    steps, below = steps[np.isfinite(steps)], counts[counts < 0.0]
+    steps, below = steps[np.isfinite(steps)], spread_below_zero(counts)
     noise = MAD_TO_SIGMA * float(np.median(np.abs(counts - np.median(counts))))
     if steps.size:
         noise = min(noise, MAD_TO_SIGMA * float(np.median(np.abs(steps))) / np.sqrt(2.0))
-    if below.size:
-        noise = min(noise, float(np.median(-below)) / HALF_NORMAL_MEDIAN)
+    if below > 0.0:
+        noise = min(noise, below)
     brightest = float(used.max() - np.median(used))
     if brightest <= NOISE_SIGMAS * noise:
         text = (
