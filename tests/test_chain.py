@@ -220,6 +220,9 @@ def test_particles_and_tracks_are_those_of_the_commands(by_commands: Path) -> No
         written = lf.open_particles(by_commands / "particles" / f"{name}.vtkhdf")
         np.testing.assert_array_equal(points.position_mm, written.position_mm)
         assert points.attributes == written.attributes
+        # Those in front of and behind the volume lie before its 30 x 22 microlenses, too.
+        before = np.all(np.abs(points.position_mm[:, :2]) <= (1.5, 1.1), axis=1)
+        assert points.attributes["particles_per_lens"] == pytest.approx(before.sum() / 660.0, rel=1e-3)
         for array in written.arrays:
             np.testing.assert_array_equal(points.arrays[array], written.arrays[array])
     tracks, written = lf.track(*found), lf.open_tracks(by_commands / "tracks.vtkhdf")

@@ -284,8 +284,9 @@ def points_of(bench: Bench, frame: Frame, found: Particles, size: TracerSize, pr
     content = bench.content
     space = _space(content, bench.settings)
     bounds = np.array([content.weights.grid.bounds_mm(axis) for axis in range(3)])
-    inside = np.all((found.position_mm >= bounds[:, 0]) & (found.position_mm <= bounds[:, 1]), axis=1)
-    # How many microlenses the volume fills as the scene shows them.
+    within = (found.position_mm >= bounds[:, 0]) & (found.position_mm <= bounds[:, 1])
+    inside = np.all(within, axis=1)
+    # How many microlenses the volume fills as the scene shows them; they see what lies in front of and behind it, too.
     camera, (width, height, _) = content.camera, np.diff(bounds)[:, 0]
     lenses = float(width * height) * camera.magnification**2 / camera.lattice.cell_area
     left, haze = what_is_left(frame, found), frame.haze
@@ -320,7 +321,7 @@ def points_of(bench: Bench, frame: Frame, found: Particles, size: TracerSize, pr
             "residual_rms_counts": left_rms,
             "excluded_pixels": int(np.count_nonzero(frame.unusable)),
             "read_noise_counts": noise,
-            "particles_per_lens": float(np.count_nonzero(inside)) / lenses,
+            "particles_per_lens": float(np.count_nonzero(np.all(within[:, :2], axis=1))) / lenses,
             "depth_ambiguous": float(np.mean(found.ambiguous[inside])) if inside.any() else 0.0,
             "beyond_depths": float(np.mean(found.beyond)) if inside.size else 0.0,
         }
