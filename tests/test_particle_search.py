@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial import KDTree
 
 import lfpiv_cli as lf
 from lfpiv_cli.arrays import Floats
@@ -202,6 +203,20 @@ def test_errors_grow_where_light_is_left_and_most_in_depth(view: View) -> None:
     assert growth[1, 2] == pytest.approx(4.0, abs=0.5)
     assert growth[1, 0] == pytest.approx(2.2, abs=0.3)
     assert np.all(growth[1] > growth[0])
+
+
+@pytest.mark.thorough
+def test_errors_know_what_is_missing_around(task: Task, tracers: Floats) -> None:
+    """Chi-squared of one that stays is 0.95 without a tracer near it, whose light its neighbours take up."""
+    sigma = []
+    for particles in (tracers, np.delete(tracers, 3, axis=0)):
+        state = search.with_measured_noise(task, begun_with(task, particles.copy()))
+        search.sweep(task, state, 0.02, 6)
+        here = search.result(task, state)
+        which = KDTree(task.camera.to_image_axes(here.position_mm)).query(tracers[23, :3])[1]
+        assert here.chi2[which] < 1.0
+        sigma.append(np.sqrt(here.covariance_mm2[which, 2, 2]))
+    assert sigma[1] > 2.0 * sigma[0]
 
 
 def test_errors_do_not_grow_for_what_is_noise(view: View) -> None:

@@ -98,6 +98,8 @@ BEST_PERCENTILE, TAKEN_UP, DOUBTFUL_EXCESS = 5.0, 12.0, 0.15
 # Noise that grows with a particle's light is none of its neighbours: the best ones are those of so many classes of
 # light, of at least so many particles.
 CLASSES, SMALLEST_CLASS = 8, 60
+# What raises chi-squared further is plain in each particle that it concerns, and concerns others no more.
+PLAIN_CHI2 = 3.0
 # Particles of which so much is seen tell what fits best.
 LEAST_SEEN = 0.5
 # Lengths are in the camera's own units (`Scale`): microlenses laterally, depths over which light spreads by one lens
@@ -389,20 +391,20 @@ def usual_chi2(chi2: Floats) -> float:
     return float(np.percentile(chi2, GOOD_PERCENTILE)) if chi2.size else 1.0
 
 
-def missing_light(chi2: Floats, light: Floats, known: NDArray[np.bool_], pixels: float) -> Floats:
+def missing_light(chi2: Floats, light: Floats, known: NDArray[np.bool_], pixels: float | Floats) -> Floats:
     """Return by what factor light that was not found raises the variance of particles (n,), 1 or more.
 
     Parameters
     ----------
     chi2, light, known : (n,) of the particles, and whether they are well seen
-    pixels : over which a particle's light is spread: of as many, noise alone scatters chi-squared
+    pixels : over which that light is spread, of each (n,) or of all: of as many, noise alone scatters chi-squared
     """
-    scatter = float(np.sqrt(2.0 / pixels))
-    best, noisier = 1.0, np.ones(len(chi2))
+    scatter = np.sqrt(2.0 / pixels)
+    best, noisier = np.ones((2, len(chi2)))
     if known.any():
         fit_best = float(np.percentile(chi2[known], BEST_PERCENTILE))
         # The best ones of many are by chance below what noise makes.
-        best = min(fit_best / (1.0 + scatter * ndtri(0.01 * BEST_PERCENTILE)), 1.0)
+        best = np.minimum(fit_best / (1.0 + scatter * ndtri(0.01 * BEST_PERCENTILE)), 1.0)
         number = int(np.clip(np.count_nonzero(known) // SMALLEST_CLASS, 1, CLASSES))
         classes = np.array_split(np.flatnonzero(known)[np.argsort(light[known], kind="stable")], number)
         of_classes = [float(np.percentile(chi2[members], BEST_PERCENTILE)) for members in classes]
@@ -410,6 +412,18 @@ def missing_light(chi2: Floats, light: Floats, known: NDArray[np.bool_], pixels:
         noisier = np.interp(light, middles, of_classes) / max(fit_best, np.finfo(np.float64).tiny)
     over = np.sqrt(np.maximum(chi2 / (noisier * best * (1.0 + scatter)), 1.0)) - 1.0
     return np.asarray(np.maximum(noisier, 1.0) * (1.0 + TAKEN_UP * over**2 / (over + DOUBTFUL_EXCESS)))
+
+
+def missing_around(view: View, particles: Floats, chi2: Floats, known: NDArray[np.bool_]) -> Floats:
+    """Return `missing_light` of particles (n, 4) by chi-squared (n,) of each, or of all around where that says more.
+
+    What is missing may hide in noise in each of them, and shows in all together.
+    """
+    overlaps, pixels = overlaps_of(view, particles), lens_pixels(view)
+    number = 1.0 + disturbance(overlaps, np.ones(len(particles)))
+    together = (chi2 + disturbance(overlaps, np.minimum(chi2, PLAIN_CHI2))) / number
+    light = particles[:, 3]
+    return np.maximum(missing_light(chi2, light, known, pixels), missing_light(together, light, known, pixels * number))
 
 
 def result(task: Task, state: State) -> Particles:
@@ -425,7 +439,7 @@ def result(task: Task, state: State) -> Particles:
     changes = [] if task.haze_error is None else [task.haze_error]
     if task.light_covariance is not None:
         changes.extend(changes_of_light(task.view, particles, task.light_covariance, task.depths_mm))
-    missing = missing_light(chi2, particles[:, 3], seen > LEAST_SEEN, lens_pixels(task.view))
+    missing = missing_around(task.view, particles, chi2, seen > LEAST_SEEN)
     covariance = joint_covariance(observation, particles, correlation, missing, np.array(changes) if changes else None)
     # Where there is a model: elsewhere is the light of particles that were not found.
     lit = task.usable & (task.light - state.residual > LIT_SIGMAS * state.noise.read_counts)
