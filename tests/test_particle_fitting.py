@@ -329,6 +329,16 @@ def test_read_noise_of_whole_counts_is_that_of_what_was_rounded(rng: np.random.G
     assert read_noise(np.rint(counts)) == pytest.approx(np.hypot(spread, ROUNDING_COUNTS), rel=0.06)
 
 
+def test_noise_of_light_is_found_of_whole_counts(rng: np.random.Generator) -> None:
+    """The median of what one or two steps are apart is one of these: no noise at all was found of it."""
+    model = 1.0 + rng.exponential(4.0, 20_000)
+    left = np.rint(model + rng.normal(size=model.size) * np.sqrt(0.06 * model)) - model
+    found = measured_noise(model, left, np.ones(model.size, np.bool_), Noise(ROUNDING_COUNTS, 1.0))
+    for light in (4.0, 12.0):
+        weight = found.weights(np.full(1, light), np.zeros(1), 0.0)
+        assert 1.0 / weight == pytest.approx(0.06 * light + ROUNDING_COUNTS**2, rel=0.3)
+
+
 @pytest.mark.thorough
 def test_noise_is_what_a_fit_leaves_and_rounding_does_not_tell_it(rng: np.random.Generator) -> None:
     model = rng.uniform(0.0, 2000.0, 100_000)

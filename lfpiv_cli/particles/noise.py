@@ -38,6 +38,8 @@ LAGS_PX = range(1, 9)
 CLASSES, FEWEST_CLASSES, SMALLEST_CLASS = 32, 3, 100
 # Of more pixels than twice so many some tell as well as all: medians of classes to 1.5 %.
 ENOUGH_PIXELS = 200_000
+# Multiples of the golden section lie evenly between whole numbers, however many.
+GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)
 # Pixels whose brightness differs by a smaller share differ by rounding.
 ALIKE = 1e-6
 
@@ -144,7 +146,9 @@ def measured_noise(model: Floats, residual: Floats, usable: NDArray[np.bool_], n
     number = min(CLASSES, lit.size // SMALLEST_CLASS)
     if number < 1:
         return noise
-    light, left = model[lit], residual[lit]
+    # Whole counts are spread over what was rounded to them: a median of few steps is one of these.
+    spread = ROUNDING_COUNTS * np.sqrt(12.0) * ((GOLDEN * np.arange(lit.size)) % 1.0 - 0.5)
+    light, left = model[lit], residual[lit] + spread
 
     # As many pixels in each class as may be. Where light fills a micro-image its pixels are alike but for rounding: it
     # must not tell where they belong, and classes that are left with few pixels by that say nothing.
@@ -157,9 +161,8 @@ def measured_noise(model: Floats, residual: Floats, usable: NDArray[np.bool_], n
     if not classes:
         return noise
     brightness = np.array([np.mean(light[members]) for members in classes])
-    variance = np.array([np.median(left[members] ** 2) for members in classes]) / HALF_NORMAL_MEDIAN**2
-    if not np.all(variance > 0.0):
-        return noise
+    squares = np.array([np.median(left[members] ** 2) for members in classes]) / HALF_NORMAL_MEDIAN**2
+    variance = squares - ROUNDING_COUNTS**2
     terms = np.column_stack([brightness, brightness**2])
     if len(classes) < FEWEST_CLASSES:
         terms[:, 1] = 0.0
