@@ -16,10 +16,13 @@ import pytest
 import lfpiv_cli as lf
 from lfpiv_cli.cli.main import cli
 from lfpiv_cli.errors import ConfigError, InputError, LimitMissedError, UsageError
-from lfpiv_cli.files.config import load_rig
+from lfpiv_cli.files.config import carried_config, load_rig
 from lfpiv_cli.files.images import write_tiff
 from lfpiv_cli.files.particle_file import read_particles
 from lfpiv_cli.files.vtkhdf import open_vectors, open_volume
+from lfpiv_cli.reconstruction.haze import ROUNDING_COUNTS
+from lfpiv_cli.reconstruction.images import light
+from lfpiv_cli.verbs.frames import bench_of
 from tests.commands import CONFIG, SAMPLE, run, summary_of
 
 
@@ -208,6 +211,17 @@ def test_volumes_and_vectors_are_those_of_the_commands(by_commands: Path) -> Non
     settings = rig.resolved()["correlation"] | {"exponent": 0.5}
     plain = lf.correlate(*arrays, voxel_mm=pair[0].grid.spacing_mm, **settings)
     np.testing.assert_array_equal(plain.displacement_voxel, written_field.displacement_voxel)
+
+
+@pytest.mark.thorough
+def test_rounding_hides_the_level_between_lens_images(by_commands: Path) -> None:
+    weights = lf.open_weights(by_commands / "weights.h5")
+    bench = bench_of(weights, carried_config(weights.provenance, "the weights"), image("dark"), None)
+    # With a twelfth of the gain: noise of half a count.
+    coarse = np.rint(light(image("pair_a"), image("dark"), None) / 12.0)
+    haze, error = bench.haze_in(coarse, np.zeros((448, 600), np.bool_))
+    assert haze is None
+    assert ROUNDING_COUNTS <= error < 0.5
 
 
 @pytest.mark.thorough

@@ -32,7 +32,7 @@ from lfpiv_cli.files.provenance import sha256
 from lfpiv_cli.files.weights_file import WeightsFile
 from lfpiv_cli.notice import Notice, written
 from lfpiv_cli.reconstruction import images as of_images
-from lfpiv_cli.reconstruction.haze import Haze, white_of
+from lfpiv_cli.reconstruction.haze import ROUNDING_COUNTS, Haze, white_of
 from lfpiv_cli.reconstruction.images import Image, Mask
 from lfpiv_cli.reconstruction.solvers import Normalisers, Operator, normalisers
 from lfpiv_cli.robust import MAD_TO_SIGMA, spread_below_zero
@@ -277,7 +277,7 @@ class Bench:
         above = lit[row, column] - level
         dark = above[np.abs(above) < DARK_SIGMAS * noise]
         if dark.size > MOST_DARK * above.size and np.median(dark) < LEAST_SIGMAS * noise:
-            return None, abs(float(np.median(dark)))
+            return None, float(np.hypot(np.median(dark), ROUNDING_COUNTS))
         white = white_of(calibration)
         known = level_error(noise, self.lens_images.between.size)
         return (None, 0.0) if white is None else white.haze_in(lit, ~unusable, (level, noise), known)
