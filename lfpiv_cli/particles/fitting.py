@@ -168,12 +168,7 @@ def fit_best(
         if starts[n, 0, 3] == UNKNOWN_LIGHT:
             pixels, values = lit_by(responses, 0)
             starts[n, 0, 3] = best_light(pixels, values, observation.residual, observation.weight)
-        begin = starts[n, 0, 2]
         changes[n] = fit_one(observation, starts[n], prior, responses, choice.first)
-        # From a depth that this fit came by another one would end where it did.
-        for later in range(n + 1, len(starts)):
-            if (starts[later, 0, 2] - begin) * (starts[later, 0, 2] - starts[n, 0, 2]) < 0.0:
-                starts[later, 0, 2] = np.nan
     for _ in range(min(choice.finalists, len(starts))):
         chosen = np.argmin(changes)
         if changes[chosen] > promising:

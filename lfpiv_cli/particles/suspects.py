@@ -134,9 +134,9 @@ def _split(
 # Axes: image axes, mm; light in counts; residual and weights as flat images. A particle is a row (x, y, z, light).
 
 
-# Starts relative to the particle's depth, in depths over which light spreads by one lens (Table 2: 0.2 to 2 mm), far
-# ones first: fits from there come by others, which are needless then; its mirrored depth is another.
-OTHER_DEPTHS = np.array([-2.0, 2.0, -1.5, 1.5, -1.0, 1.0, -0.7, 0.7, -0.4, 0.4, -0.2, 0.2]) / 1.064
+# Starts relative to the particle's depth, in depths over which light spreads by one lens (Table 2: 0.2 to 2 mm); its
+# mirrored depth is another.
+OTHER_DEPTHS = np.array([-2.0, -1.5, -1.0, -0.7, -0.4, -0.2, 0.2, 0.4, 0.7, 1.0, 1.5, 2.0]) / 1.064
 STEPS = 14
 
 
