@@ -131,8 +131,33 @@ def respond_rows(view: View, bend: Bend, pixels: NDArray[np.int32], values: Sing
     if not is_seen(bend):
         return 0
     projection, entries = project(view, bend), Entries(pixels, values, room)
-    low_i, high_i, low_j, high_j = lenses_of(view, projection, bend)
+    lenses = lenses_of(view, projection, bend)
+    low_i, high_i, low_j, high_j = lenses
     side, more_mm = _shared(view, projection, bend, (high_i + low_i) // 2, (high_j + low_j) // 2)
+    count = _write_blocks(view, projection, bend, lenses, (side, more_mm), entries)
+    return count if count >= 0 else _write_blocks(view, projection, bend, lenses, (1, 0.0), entries)
+
+
+@njit(cache=True, **COUNT_NO_REFERENCES)
+def _write_blocks(
+    view: View,
+    projection: Projection,
+    bend: Bend,
+    lenses: tuple[int, int, int, int],
+    shared: tuple[int, float],
+    entries: Entries,
+) -> int:
+    """Write the entries of some lenses, block by block; return their number.
+
+    Where pixels are lit through two lenses of one block of several, their order is lost, by which those that other
+    blocks light as well are found: -1.
+
+    Parameters
+    ----------
+    lenses : the first and the last along i and along j
+    shared : see `_shared`
+    """
+    (low_i, high_i, low_j, high_j), (side, more_mm), (pixels, values, room) = lenses, shared, entries
     # Of each block: end of its entries, first and last row, first and last column.
     ends = room.lenses
     ends[0, 0] = 0
@@ -148,6 +173,8 @@ def respond_rows(view: View, bend: Bend, pixels: NDArray[np.int32], values: Sing
                 alone = high_i - low_i < side and high_j - low_j < side
                 block = Block(i, j, min(side, high_i + 1 - i), min(side, high_j + 1 - j), more_mm, alone)
                 count = _write_block(view, projection, bend, block, begin, entries, ends[shown + 1])
+            if count < 0:
+                return -1
             if count == 0:
                 continue
             shown += 1
@@ -269,7 +296,8 @@ def _write_block(
 ) -> int:
     """Write the entries of a block of lenses with rectangular cells from `begin` on; return their number.
 
-    Sets the rectangle of pixels that they lie in: first and last row, first and last column, from the second number on.
+    -1 where the block is not alone and two of its lenses light a pixel. Sets the rectangle of pixels that they lie in:
+    first and last row, first and last column, from the second number on.
     """
     camera, room, x, y = view.camera, entries.room, projection.x, projection.y
     middle = view.centres_mm[block.j + block.rows // 2, block.i + block.columns // 2]
@@ -283,6 +311,8 @@ def _write_block(
     rows = _line_up(view, projection, (bend, bent), block, AXES[1], room)
     if rows == 0:
         return 0
+    if not block.alone and (_has_twins(room, AXES[0], columns) or _has_twins(room, AXES[1], rows)):
+        return -1
     _fill(view, x, x.stretch * x.alpha + bent.gain_x, columns, room.table)
     _fill(view, y, y.stretch * y.alpha + bent.gain_y, rows, room.table[DOWN:])
     for k in range(2):
@@ -328,12 +358,13 @@ def _line_up(
         shift = (1.0 - camera.bend) * s - along.lever * along.beta * along.x
         reach = along.half + along.radius + block.more_mm
         first, number = lit_pixels(view, gain, offset, reach, along.scale, shift, along.pixels)
+        earlier = count - 1
         for place in range(first, first + min(number, LONGEST - count)):
             table[PATCH + count] = ((place + 0.5 - 0.5 * along.pixels) * camera.pixel_mm - shift) / along.scale
             table[OFFSET + count], table[DRIFT + count] = offset, centres[j, i, 1 - axis] - middle
             table[MOVED + count] = moved / by_place
             places[count], twins[count] = place, -1
-            before = count - 1
+            before = earlier
             while before >= 0 and places[before] > place:
                 before -= 1
             if before >= 0 and places[before] == place:
@@ -343,14 +374,25 @@ def _line_up(
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
+def _has_twins(room: Scratch, axis: int, count: int) -> bool:
+    """Return whether two lenses of a block light a pixel along an axis."""
+    twice = False
+    for n in range(count):
+        twice = twice or room.lines[TWIN[axis], n] >= 0
+    return twice
+
+
+@njit(cache=True, **COUNT_NO_REFERENCES)
 def _set_away(room: Scratch, columns: int) -> None:
     """Set how far from the axis the patches of columns lie, or those of their twins where these are nearer."""
     table, twins = room.table, room.lines[TWIN[0]]
     for n in range(columns):
         table[AWAY + n] = abs(table[PATCH + n])
         if twins[n] >= 0:
-            nearer = min(table[AWAY + n], table[AWAY + twins[n]])
-            table[AWAY + n] = table[AWAY + twins[n]] = nearer
+            table[AWAY + twins[n]] = min(table[AWAY + n], table[AWAY + twins[n]])
+    for n in range(columns):
+        if twins[n] >= 0:
+            table[AWAY + n] = table[AWAY + twins[n]]
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
@@ -433,9 +475,7 @@ def _write_rows(
         of_curved = _curved(view, projection, bend, bent)
     else:
         of_plane = _plane(view, projection, bend)
-    at, twice_lit = begin, False
-    for n in range(columns):
-        twice_lit = twice_lit or lines[TWIN[0], n] >= 0
+    at, twice_lit = begin, _has_twins(room, AXES[0], columns)
     rectangle[1], rectangle[2], rectangle[3], rectangle[4] = camera.rows, -1, camera.columns, -1
     for m in range(rows):
         low, high = _columns_within(table, columns, outside - table[DOWN + PATCH + m] ** 2)
@@ -454,9 +494,9 @@ def _write_rows(
         row = lines[PLACE[1], m]
         take_row(table, chosen, (at, lines[PLACE[0]], row * camera.columns), pixels, values)
         at += high - low
-        twin = lines[TWIN[1], m]
-        if twin >= 0:
-            _join_twin_rows(lines, (twin, lines[ENTRY, twin + 1]), (m, at), values)
+        for earlier in range(lines[TWIN[1], m], m if lines[TWIN[1], m] >= 0 else -1):
+            if lines[PLACE[1], earlier] == row:
+                _join_twin_rows(lines, (earlier, lines[ENTRY, earlier + 1]), (m, at), values)
         rectangle[1], rectangle[2] = min(rectangle[1], row), max(rectangle[2], row)
         rectangle[3], rectangle[4] = min(rectangle[3], lines[0, low]), max(rectangle[4], lines[0, high - 1])
     return at - begin
