@@ -249,6 +249,18 @@ def test_crowded_tracers_are_told_apart_and_their_errors_are_covered(table2: Cam
 
 
 @pytest.mark.thorough
+def test_crowds_are_checked_until_hardly_any_more_are_found(table2: Camera, water: Media) -> None:
+    # 1.8 for each microlens: three checks find a third, and sixteen beside the light of merged ones nine in ten.
+    rng = np.random.default_rng(7)
+    true = rng.uniform((-1.3, -1.1, 0.95, 3e5), (1.3, 1.1, 2.85, 7e5), (1030, 4))
+    state = first_pass(task_with(table2, water, true, rng))
+    found = particle_figures(state.particles[:, :3], true[:, :3], [-1.0, -0.8, 0.95], [1.0, 0.8, 2.85], 0.1)
+    assert found["recall"] > 0.95
+    assert found["precision"] > 0.8
+    assert state.typical_light < 6e5
+
+
+@pytest.mark.thorough
 def test_tracers_beyond_the_volume_are_found_there(table2: Camera, water: Media) -> None:
     # Two thirds lie up to 1 mm outside. Held within 0.3 mm of it, 22 ended there, and depths of those inside were seven
     # times as far off.

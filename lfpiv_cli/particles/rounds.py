@@ -36,6 +36,7 @@ from lfpiv_cli.particles.search import (
     prune,
     result,
     sweep,
+    usual_light,
     with_measured_noise,
     with_typical_light,
 )
@@ -74,8 +75,11 @@ ROUNDS = (
 # Sweeps of refinement after candidates and after splitting.
 SWEEPS, SWEEPS_AFTER_SPLIT = 4, 1
 # How often particles are checked with the noise that they leave, at most: until hardly any more are found, of 0.65 for
-# each microlens after three times, of 2 after ten.
-MOST_CHECKS, HARDLY_ANY = 16, 0.003
+# each microlens after three times, of 2 after ten to twenty.
+MOST_CHECKS, HARDLY_ANY = 40, 0.003
+# Of crowds the first ones found are several in one, and those too faint beside them that are single: where the brighter
+# ones, at this percentile, are fainter than what was typical, they are.
+BRIGHTER_PERCENTILE = 75.0
 # Before any particle is known, its light is taken from the peaks: one in ten is brighter than a typical particle. Where
 # not even so many stand out of the noise, as with few tracers, most peaks are noise: then one in ten of those that do.
 FIRST_TYPICAL_PERCENTILE = 90.0
@@ -132,6 +136,8 @@ def finished(task: Task, state: State, settings: Round, checks: int = MOST_CHECK
         # What could not be split may be now; what could not be moved, with the noise that is measured first.
         state = replace(state, unsplit=state.unsplit[:0], unmoved=state.unmoved if check else state.unmoved[:0])
         fits = judged(task, state, LAST_UNEXPLAINED)
+        fainter = usual_light(state, fits, BRIGHTER_PERCENTILE) or state.typical_light
+        state = replace(state, typical_light=min(state.typical_light, fainter))
         state = with_depths_corrected(task, state, fits.chi2, LAST_UNEXPLAINED)
         state = with_overlaps_split(task, state, fits.chi2, LAST_UNEXPLAINED, thorough=True)
         if check > 0 and len(state.particles) - before <= HARDLY_ANY * before:

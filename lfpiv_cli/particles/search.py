@@ -369,14 +369,19 @@ def judged(task: Task, state: State, unexplained: float) -> Fits:
 
 
 def with_typical_light(task: Task, state: State, fits: Fits) -> State:
-    """Return the state with the median light of the better fitting half, which holds fewer merged particles.
+    """Return the state with the light of a typical particle, and the noise that goes with it."""
+    typical = usual_light(state, fits, 50.0)
+    return replace(state, typical_light=typical, noise=noise_with(task, typical))
 
-    Those that are hardly seen fit anything; where there are no others, the typical light is not known: 0.
+
+def usual_light(state: State, fits: Fits, percentile: float) -> float:
+    """Return a percentile of the light of the better fitting half, which holds fewer merged particles.
+
+    Those that are hardly seen fit anything; where there are no others, the light is not known: 0.
     """
     seen = fits.seen > SMALLEST_SEEN
     light, chi2 = state.particles[seen, 3], fits.chi2[seen]
-    typical = float(np.median(light[chi2 <= np.median(chi2)])) if light.size else 0.0
-    return replace(state, typical_light=typical, noise=noise_with(task, typical))
+    return float(np.percentile(light[chi2 <= np.median(chi2)], percentile)) if light.size else 0.0
 
 
 def with_measured_noise(task: Task, state: State, left: Floats | None = None) -> State:
