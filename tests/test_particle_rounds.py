@@ -18,13 +18,13 @@ from lfpiv_cli.optics.waves import Waves
 from lfpiv_cli.particles.joining import boxes_of, explain_rest, find_peaks
 from lfpiv_cli.particles.rounds import ROUNDS, find_particles, first_pass, first_typical_light
 from lfpiv_cli.particles.search import noise_with
-from lfpiv_cli.particles.view import lens_pixels
+from lfpiv_cli.particles.view import Light, lens_pixels, raw_view
 from lfpiv_cli.reconstruction.solvers import normalisers
 from lfpiv_cli.synthetic.render import Balls, render_points
 from lfpiv_cli.validation.volume import particle_figures
 from lfpiv_cli.weights.model import Weights
 from tests.commands import WATER
-from tests.particle_images import seen_by, task_for, task_with
+from tests.particle_images import light_on, seen_by, task_for
 
 
 def grid_of(shape_xyz: tuple[int, int, int], z_mm: float, spacing_mm: tuple[float, float, float] = (0.1,) * 3) -> Grid:
@@ -230,34 +230,37 @@ def test_typical_light_is_not_the_noise_s_and_peaks_have_light() -> None:
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize("seed", [0, 1, 5])
-def test_crowded_tracers_are_told_apart_and_their_errors_are_covered(table2: Camera, water: Media, seed: int) -> None:
-    # 1.5 for each microlens within 1.9 mm: many have one peak, and the image's own noise alone tells them apart.
-    rng = np.random.default_rng(seed)
+@pytest.mark.parametrize(
+    ("per_lens", "seed", "least"), [(1.5, 0, 0.92), (1.5, 1, 0.92), (1.5, 5, 0.92), (2.2, 7, 0.93)]
+)
+def test_crowded_tracers_are_told_apart_and_their_errors_are_covered(
+    table2: Camera, water: Media, per_lens: float, seed: int, least: float
+) -> None:
+    # Within 1.9 mm many have one peak, and the image's own noise alone tells them apart.
+    rng, camera = np.random.default_rng(seed), replace(table2, columns=500, rows=420)
     low, high = np.array([-1.0, -0.8, 0.95]), np.array([1.0, 0.8, 2.85])
-    true = rng.uniform((-1.3, -1.1, 0.95, 3e5), (1.3, 1.1, 2.85, 7e5), (858, 4))
-    task = task_with(table2, water, true, rng)
+    true = rng.uniform((-1.3, -1.1, 0.95, 3e5), (1.3, 1.1, 2.85, 7e5), (int(572 * per_lens), 4))
+    image = with_noise(seen_by(camera, water, true, (low[2], high[2])), rng)
+    task = task_for(image, camera, water, grid_of((20, 16, 20), 1.9))
     found = find_particles(task)
     sigma = np.sqrt(np.diagonal(found.covariance_mm2, axis1=1, axis2=2))
     places = task.camera.to_image_axes(true[:, :3])
     figures = particle_figures(found.position_mm, places, low, high, 0.1, sigma)
-    # Without the last checks 0.78 and 0.80 of the first two were found, and 0.55 to 0.68 of their errors covered; with
-    # errors that grow with chi-squared itself, from 1 on, 0.80 to 0.95 in place of 0.88 to 0.98.
-    assert figures["recall"] > 0.9
-    assert figures["precision"] > 0.85
-    assert min(figures[f"coverage_{axis}"] for axis in "xyz") > 0.86
+    # With the noise taken for all that is left, and what fits badly for what fits worse than good ones, 0.92 of 1.5 for
+    # each microlens were found, of 2.2 less than 0.8, and of their errors 0.78 were covered.
+    assert figures["recall"] > least
+    assert figures["precision"] > 0.93
+    assert min(figures[f"coverage_{axis}"] for axis in "xyz") > 0.88
 
 
 @pytest.mark.thorough
-def test_crowds_are_checked_until_hardly_any_more_are_found(table2: Camera, water: Media) -> None:
-    # 1.8 for each microlens: three checks find a third, and sixteen beside the light of merged ones nine in ten.
-    rng = np.random.default_rng(7)
-    true = rng.uniform((-1.3, -1.1, 0.95, 3e5), (1.3, 1.1, 2.85, 7e5), (1030, 4))
-    state = first_pass(task_with(table2, water, true, rng))
-    found = particle_figures(state.particles[:, :3], true[:, :3], [-1.0, -0.8, 0.95], [1.0, 0.8, 2.85], 0.1)
-    assert found["recall"] > 0.95
-    assert found["precision"] > 0.8
-    assert state.typical_light < 6e5
+def test_where_the_model_of_light_is_wrong_tracers_are_not_split(table2: Camera, water: Media) -> None:
+    # One for each microlens in light as waves, fitted by rays: as long as more than noise is left 1.55 times as many.
+    rng, camera, grid = np.random.default_rng(1), replace(table2, columns=500, rows=420), grid_of((20, 16, 60), 0.0)
+    true = rng.uniform((-1.3, -1.1, -3.0, 3e5), (1.3, 1.1, 3.0, 7e5), (572, 4))
+    waves = raw_view(camera, water, 0.025, light=Light(532e-6, 0.3, (-4.7, 4.7)))
+    image = with_noise(light_on(waves, true, grid.bounds_mm(2)), rng)
+    assert len(find_particles(task_for(image, camera, water, grid)).position_mm) < 1.25 * len(true)
 
 
 @pytest.mark.thorough
@@ -302,14 +305,14 @@ def test_errors_of_single_tracers_near_the_focal_plane_are_covered(
 ) -> None:
     camera, over_sigma = replace(table2, columns=150, rows=150), []
     grid = grid_of((5, 5, 50), 0.0, (0.1, 0.1, 0.2))
-    for seed in range(100, 112):
+    for seed in range(100, 124):
         rng = np.random.default_rng(seed)
         true = rng.uniform((-0.1, -0.1, -0.8), (0.1, 0.1, 0.8), (1, 3))
         image = with_noise(by_rays(camera, true, light, rng, waves=waves), rng)
         found = find_particles(task_for(np.rint(image), camera, water, grid))
         assert len(found.position_mm) >= 1
         over_sigma.append((found.position_mm[0] - true[0]) / np.sqrt(np.diagonal(found.covariance_mm2[0])))
-    # Of twelve within two binomial standard errors of what many show: 0.97, and 0.77 by waves.
+    # Of 24 within two binomial standard errors of what many show: 0.97, and 0.77 by waves.
     assert np.all(np.mean(np.abs(over_sigma) < 1.96, axis=0) >= least)
     # Nor are errors stated that are much too large: three to five times they were.
     assert np.all(np.median(np.abs(over_sigma), axis=0) > 0.3)

@@ -418,9 +418,9 @@ def test_tracers_are_counted_few_or_crowded_and_light_that_does_not_tell_is_not(
     image = image_of(bench, 12.0, 0) - np.float32(100.0)
     frame = frame_of(bench, image, image)
     points = points_of(bench, frame, find(bench, frame), TracerSize(0.05), {})
-    # What they light is nearly explained, by particles that are not there.
-    model, crowded = light_notices(points, "crowded")
-    assert (model.code, crowded.code) == ("light-model", "particles-crowded")
+    # Part of what they light is explained, by particles that are not there.
+    unexplained, crowded = light_notices(points, "crowded")
+    assert (unexplained.code, crowded.code) == ("light-unexplained", "particles-crowded")
     # Two standard errors of what one image of so few microlenses tells.
     assert crowded.measured == pytest.approx(12.0, rel=0.4)
     # What noise alone leaves is no light of tracers: where none was found it made 40 for each microlens.

@@ -37,7 +37,6 @@ from lfpiv_cli.particles.least_squares import (
     observation_of,
     room_for,
 )
-from lfpiv_cli.particles.noise import beside_neighbours
 from lfpiv_cli.particles.rounds import (
     CANDIDATE_GAIN,
     ROUNDS,
@@ -482,8 +481,7 @@ def _tried(task: Task, state: State, diameters: NDArray[np.float64], unexplained
         sized = observed(_of_diameter(task, *trial), state, unexplained)._replace(residual=observation.residual)
         change[number], _ = _fitted(observation, sized, tracers, tracers[:, 2:3])
     losses = (change - change.min(axis=0)) / np.maximum(chi2[good], 1.0)
-    noisy = with_measured_noise(task, state, beside_neighbours(state.residual, task.view.camera.columns))
-    noise_alone, *_ = judge(observed(task, noisy, 0.0), tracers)
+    noise_alone, *_ = judge(observed(task, with_measured_noise(task, state), 0.0), tracers)
     return Trial(_common(trials[:, 0], losses), losses, noise_alone <= NOISE_ALONE)
 
 

@@ -30,6 +30,7 @@ from lfpiv_cli.particles.rounds import (
     accepted,
     after_rounds,
     candidates_of,
+    concluded,
     finished,
     with_candidates,
     with_suspects_checked,
@@ -249,7 +250,7 @@ def second_pass(task: Task, own: Floats, neighbours: Sequence[Floats]) -> State:
     fits = judged(task, state, ROUNDS[-1].unexplained)
     state, _ = with_suspects_checked(task, state, fits, ROUNDS[-1])
     # First passes have told two with one peak apart.
-    return finished(task, merge(task, state), ROUNDS[-1], checks=0)
+    return concluded(task, merge(task, state), ROUNDS[-1])
 
 
 def _missing_particles(task: Task, own: Floats, neighbours: Sequence[Floats]) -> tuple[Floats, NDArray[np.bool_]]:

@@ -40,7 +40,7 @@ from lfpiv_cli.particles.search import (
     with_measured_noise,
     with_typical_light,
 )
-from lfpiv_cli.particles.suspects import with_depths_corrected, with_overlaps_split
+from lfpiv_cli.particles.suspects import good_chi2, with_depths_corrected, with_overlaps_split
 from lfpiv_cli.particles.view import lens_pixels
 
 
@@ -74,9 +74,13 @@ ROUNDS = (
 
 # Sweeps of refinement after candidates and after splitting.
 SWEEPS, SWEEPS_AFTER_SPLIT = 4, 1
-# How often particles are checked with the noise that they leave, at most: until hardly any more are found, of 0.65 for
-# each microlens after three times, of 2 after ten to twenty.
-MOST_CHECKS, HARDLY_ANY = 40, 0.003
+# How often particles are checked, and joined afterwards, at most: until that changes their number by hardly any more.
+# With 0.65 for each microlens that is after three checks and one join, with 3 after twelve and ten.
+MOST_CHECKS, MOST_JOINS, HARDLY_ANY = 40, 12, 0.003
+# Chi-squared of good ones where little more than noise is left, and by what each check must lower it until then: by a
+# tenth and more with 3 and 4 for each microlens; of tracers that are fitted by rays, but lit by waves, by a twentieth
+# to a seventh, and it stays at 3.
+NEXT_TO_NOISE, LEAST_PROGRESS = 2.0, 0.93
 # Of crowds the first ones found are several in one, and those too faint beside them that are single: where the brighter
 # ones, at this percentile, are fainter than what was typical, they are.
 BRIGHTER_PERCENTILE = 75.0
@@ -118,33 +122,74 @@ def after_rounds(
     return state
 
 
-def finished(task: Task, state: State, settings: Round, checks: int = MOST_CHECKS) -> State:
+def finished(task: Task, state: State, settings: Round) -> State:
     """Return the state refined with the noise that is left, without what does not hold then.
 
     Two tracers with one peak are told from one by that noise alone: what is assumed while most are sought leaves bright
-    pixels much freedom.
+    pixels much freedom. First all is taken for several in one that fits worse than noise lets expect, as in crowds most
+    do. Where noise alone is not left by that the model of light is wrong, and what fits worse than good ones is.
     """
-    for check in range(checks):
-        before = len(state.particles)
+    begin = replace(state, particles=state.particles.copy(), residual=state.residual.copy())
+    apart, good = told_apart(task, begin, settings, to_noise=True)
+    if good > NEXT_TO_NOISE:
+        apart, _ = told_apart(task, state, settings, to_noise=False)
+    return concluded(task, apart, settings, MOST_JOINS)
+
+
+def told_apart(task: Task, state: State, settings: Round, to_noise: bool) -> tuple[State, float]:
+    """Return the state after checks until hardly any more are found, and chi-squared of its good ones.
+
+    Suspected is what fits worse than good ones, or with `to_noise` than noise lets expect; then checks end, too, where
+    they lead no further.
+    """
+    found, good = True, np.inf
+    for check in range(MOST_CHECKS):
+        before, good_before = len(state.particles), good
         state = with_measured_noise(task, state)
         sweep(task, state, LAST_UNEXPLAINED, LAST_SWEEPS)
-        if check > 0 and len(state.particles):
+        if check > 0 and found and len(state.particles):
             candidates, light = candidates_of(task, state, settings.iterations, None)
             candidates = candidates[light > CANDIDATE_LIGHT * state.typical_light]
             state = accepted(task, state, candidates, replace(settings, unexplained=LAST_UNEXPLAINED))
             sweep(task, state, LAST_UNEXPLAINED, LAST_SWEEPS)
-        # What could not be split may be now; what could not be moved, with the noise that is measured first.
-        state = replace(state, unsplit=state.unsplit[:0], unmoved=state.unmoved if check else state.unmoved[:0])
+            found = len(state.particles) > before
+        # What could not be moved may be with the noise that is measured first.
+        state = replace(state, unmoved=state.unmoved if check else state.unmoved[:0])
         fits = judged(task, state, LAST_UNEXPLAINED)
+        good = good_chi2(fits.chi2)
+        if to_noise and good > max(NEXT_TO_NOISE, LEAST_PROGRESS * good_before):
+            break
         fainter = usual_light(state, fits, BRIGHTER_PERCENTILE) or state.typical_light
         state = replace(state, typical_light=min(state.typical_light, fainter))
-        state = with_depths_corrected(task, state, fits.chi2, LAST_UNEXPLAINED)
-        state = with_overlaps_split(task, state, fits.chi2, LAST_UNEXPLAINED, thorough=True)
+        state = with_suspects_tried(task, state, fits, 1.0 if to_noise else good)
         if check > 0 and len(state.particles) - before <= HARDLY_ANY * before:
             break
-    state = with_measured_noise(task, state)
-    sweep(task, state, LAST_UNEXPLAINED, LAST_SWEEPS)
-    state = with_twins_joined(task, state, LAST_UNEXPLAINED, judged(task, state, LAST_UNEXPLAINED).chi2)
+    return state, good
+
+
+def with_suspects_tried(task: Task, state: State, fits: Fits, good: float) -> State:
+    """Return the state after all that fit worse than `good` were tried at other depths, and all as two again."""
+    state = with_depths_corrected(task, state, fits.chi2, LAST_UNEXPLAINED, good)
+    # What could not be split may be now.
+    state = replace(state, unsplit=state.unsplit[:0])
+    return with_overlaps_split(task, state, fits.chi2, LAST_UNEXPLAINED, good, thorough=True)
+
+
+def concluded(task: Task, state: State, settings: Round, joins: int = 1) -> State:
+    """Return the state with those joined that the noise does not tell apart, without those that do not hold.
+
+    Joined ones leave the others other light: up to `joins` times, until hardly any are joined.
+    """
+    for number in range(joins):
+        state = with_measured_noise(task, state)
+        sweep(task, state, LAST_UNEXPLAINED, LAST_SWEEPS)
+        before = len(state.particles)
+        state = with_twins_joined(task, state, LAST_UNEXPLAINED, judged(task, state, LAST_UNEXPLAINED).chi2)
+        if number == joins - 1 or before - len(state.particles) <= HARDLY_ANY * before:
+            break
+        sweep(task, state, LAST_UNEXPLAINED, LAST_SWEEPS)
+        fits = judged(task, state, LAST_UNEXPLAINED)
+        state = with_suspects_tried(task, state, fits, good_chi2(fits.chi2))
     return pruned(task, state, settings)[0]
 
 
@@ -198,9 +243,10 @@ def with_suspects_checked(task: Task, state: State, fits: Fits, settings: Round)
 
     `fits` says how well they fit; returned is how well those do that stay.
     """
+    good = good_chi2(fits.chi2)
     if settings.thorough:
-        state = with_depths_corrected(task, state, fits.chi2, settings.unexplained)
-    state = with_overlaps_split(task, state, fits.chi2, settings.unexplained, settings.thorough)
+        state = with_depths_corrected(task, state, fits.chi2, settings.unexplained, good)
+    state = with_overlaps_split(task, state, fits.chi2, settings.unexplained, good, settings.thorough)
     sweep(task, state, settings.unexplained, SWEEPS_AFTER_SPLIT, SEARCH_GAIN)
     return pruned(task, with_twins_joined(task, state, settings.unexplained, fits.chi2), settings)
 

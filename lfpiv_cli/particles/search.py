@@ -25,6 +25,7 @@ from lfpiv_cli.particles.noise import (
     LIT_SIGMAS,
     PHOTONS_PER_PARTICLE,
     Noise,
+    beside_neighbours,
     error_correlation,
     measured_noise,
     pixel_weights,
@@ -384,11 +385,11 @@ def usual_light(state: State, fits: Fits, percentile: float) -> float:
     return float(np.percentile(light[chi2 <= np.median(chi2)], percentile)) if light.size else 0.0
 
 
-def with_measured_noise(task: Task, state: State, left: Floats | None = None) -> State:
-    """Return the state with the noise that its particles leave of the image, or as it is `left` (pixels,) of it."""
+def with_measured_noise(task: Task, state: State) -> State:
+    """Return the state with the noise that its particles leave of the image, neighbours' light not counted."""
     assumed = replace(state.noise, read_counts=task.read_counts)
-    residual = state.residual if left is None else left
-    return replace(state, noise=measured_noise(task.image - state.residual, residual, task.usable, assumed))
+    beside = beside_neighbours(state.residual, task.view.camera.columns)
+    return replace(state, noise=measured_noise(task.image - state.residual, beside, task.usable, assumed))
 
 
 def usual_chi2(chi2: Floats) -> float:

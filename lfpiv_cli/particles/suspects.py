@@ -178,10 +178,12 @@ CHANGED_LENSES, CHANGED_DEPTHS, CHANGED_SHARES = 0.05, 0.05 / 1.064, (0.05, 0.2)
 SETTLED = 4.0
 
 
-def with_depths_corrected(task: Task, state: State, chi2: Floats, unexplained: float) -> State:
-    """Return the state with particles moved to depths that explain the light better, the residual in place."""
+def with_depths_corrected(task: Task, state: State, chi2: Floats, unexplained: float, good: float) -> State:
+    """Return the state with particles moved to depths that explain the light better, the residual in place.
+
+    `good` is chi-squared of those that fit well.
+    """
     observation = observed(task, state, unexplained)
-    good = good_chi2(chi2)
     near_focus = footprint_radius_mm(task.view, state.particles) < NEAR_FOCUS_LENSES * 2.0 * task.view.half_x_mm
     signature = _signature(task.view.scale, state.particles, chi2)
     suspects = (near_focus | (chi2 > ELSEWHERE_CHI2 * good)) & ~_tried(state.unmoved, state, signature)
@@ -195,10 +197,14 @@ def settled(task: Task, state: State, particles: Floats) -> State:
     return replace(state, settled=_signature(task.view.scale, particles, np.ones(len(particles)))[:, :-1])
 
 
-def with_overlaps_split(task: Task, state: State, chi2: Floats, unexplained: float, thorough: bool) -> State:
-    """Return the state with overlapping particles separated; `thorough`: also those of usual brightness."""
+def with_overlaps_split(
+    task: Task, state: State, chi2: Floats, unexplained: float, good: float, thorough: bool
+) -> State:
+    """Return the state with overlapping particles separated; `thorough`: also those of usual brightness.
+
+    `good` is chi-squared of those that fit well.
+    """
     observation = observed(task, state, unexplained)
-    good = good_chi2(chi2)
     bright = state.particles[:, 3] > (ENOUGH_FOR_TWO if thorough else BRIGHT) * state.typical_light
     signature = _signature(task.view.scale, state.particles, chi2)
     suspects = bright & (chi2 > SUSPECT_CHI2 * good) & ~_tried(state.unsplit, state, signature)
