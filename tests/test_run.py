@@ -25,7 +25,7 @@ from tests.commands import summary_of as told_of
 
 PAIR = SAMPLE / "pair_a.tif", SAMPLE / "pair_b.tif"
 PHOTOGRAPHS = [word for name in ("white", "dark", "board") for word in (f"--{name}", SAMPLE / f"{name}.tif")]
-RIGHT = "0.55 tracers for each microlens, and particles err less up to about 2"
+RIGHT = "0.55 tracers for each microlens, and particles err less up to about 3"
 FILES = ("calibration.h5", "calibration.png", "weights.h5", "volumes/pair_a.vtkhdf", "volumes/pair_b.vtkhdf")
 VECTORS = "vectors.vtkhdf"
 
@@ -350,7 +350,7 @@ def test_what_cannot_be_is_said_before_anything_is_made(
         (None, "auto", ("particles",), "too little"),
         (3.1, "both", ("volumes", "particles"), "--method"),
         (3.1, "particles", ("particles",), "as asked for; but there are 3.1 tracers"),
-        (0.6, "volumes", ("volumes",), "particles err less up to about 2"),
+        (0.6, "volumes", ("volumes",), "particles err less up to about 3"),
     ],
 )
 def test_the_method_is_what_errs_less(

@@ -29,9 +29,9 @@ from lfpiv_cli.verbs.run_steps import Chain, RunOptions, Vectors
 
 REPORT = "report.html"
 
-# Vectors by particles err less than those by volumes up to 1.9 tracers for each microlens, and more from 2.4 on, in the
-# laminar channel of the paper.
-MOST_FOR_PARTICLES = 2.0
+# Up to so many tracers for each microlens vectors by particles err less than those by volumes in the laminar channel of
+# the paper; more were not tried.
+MOST_FOR_PARTICLES = 3.0
 
 
 @dataclass(frozen=True)
