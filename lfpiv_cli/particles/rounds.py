@@ -126,20 +126,20 @@ def finished(task: Task, state: State, settings: Round) -> State:
     """Return the state refined with the noise that is left, without what does not hold then.
 
     Two tracers with one peak are told from one by that noise alone: what is assumed while most are sought leaves bright
-    pixels much freedom. First all is taken for several in one that fits worse than noise lets expect, as in crowds most
-    do. Where noise alone is not left by that the model of light is wrong, and what fits worse than good ones is.
+    pixels much freedom. First all that fits worse than the noise predicts is taken for several in one, as in crowds
+    most are. Where that does not leave noise alone the model of light is wrong, and only what fits worse than good ones is.
     """
     begin = replace(state, particles=state.particles.copy(), residual=state.residual.copy())
-    apart, good = told_apart(task, begin, settings, to_noise=True)
+    apart, good = separated(task, begin, settings, to_noise=True)
     if good > NEXT_TO_NOISE:
-        apart, _ = told_apart(task, state, settings, to_noise=False)
+        apart, _ = separated(task, state, settings, to_noise=False)
     return concluded(task, apart, settings, MOST_JOINS)
 
 
-def told_apart(task: Task, state: State, settings: Round, to_noise: bool) -> tuple[State, float]:
+def separated(task: Task, state: State, settings: Round, to_noise: bool) -> tuple[State, float]:
     """Return the state after checks until hardly any more are found, and chi-squared of its good ones.
 
-    Suspected is what fits worse than good ones, or with `to_noise` than noise lets expect; then checks end, too, where
+    Suspected is what fits worse than good ones, or with `to_noise` than the noise predicts; then checks end, too, where
     they lead no further.
     """
     found, good = True, np.inf
