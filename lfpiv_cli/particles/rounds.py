@@ -127,7 +127,8 @@ def finished(task: Task, state: State, settings: Round) -> State:
 
     Two tracers with one peak are told from one by that noise alone: what is assumed while most are sought leaves bright
     pixels much freedom. First all that fits worse than the noise predicts is taken for several in one, as in crowds
-    most are. Where that does not leave noise alone the model of light is wrong, and only what fits worse than good ones is.
+    most are. Where that does not leave noise alone the model of light is wrong, and only what fits worse than good ones
+    is.
     """
     begin = replace(state, particles=state.particles.copy(), residual=state.residual.copy())
     apart, good = separated(task, begin, settings, to_noise=True)
