@@ -410,6 +410,19 @@ def test_uncertainties_that_are_too_small_are_found_out(pair: tuple[VectorField,
     np.testing.assert_allclose(found.widened, [[3.0] * 3, [1.0] * 3], rtol=0.15)
 
 
+def test_where_vectors_err_alike_by_more_than_stated_they_count_for_less(pair: tuple[VectorField, VectorField]) -> None:
+    first, second = pair
+    assert first.uncertainty_voxel is not None
+    # Three depths of twelve, of the noisier field, one way.
+    depths = slice(8, 11)
+    first.displacement_voxel[depths] += 2.0 * first.uncertainty_voxel[depths]
+    found = combine(first, second).field
+    assert found.uncertainty_voxel is not None
+    error = found.displacement_voxel - truth()
+    assert np.all(rms(found.displacement_voxel)[depths] < 1.1 * rms(second.displacement_voxel)[depths])
+    assert np.sqrt(np.mean((error / found.uncertainty_voxel)[depths] ** 2)) < 1.3
+
+
 def test_what_cannot_be_weighed_only_fills_gaps(pair: tuple[VectorField, VectorField]) -> None:
     first, second = pair
     flags = first.flag.copy(), second.flag.copy()

@@ -5,10 +5,10 @@ origin, so that each component takes the weighted mean of both. Measured vectors
 that their distances from the other field's show; where these are too few to tell, they serve only where the other field
 has none. A vector that neighbours replaced serves only where nothing was measured.
 
-The differences of the two are a check of what they state. Where these are larger than stated all over the field, it is
-the field with the larger uncertainties that makes most of them, and those above all are widened until they explain
-them. Two vectors that lie further apart even so cannot both be right, and their mean would be wrong for certain: the
-one that fits the vectors around it is kept, as a whole.
+The differences of the two are a check of what they state. Where these are larger than stated, all over the field or
+about a vector, it is the field with the larger uncertainties that makes most of them, and those above all are widened
+until they explain them. Two vectors that lie further apart than all over the field cannot both be right, and their mean
+would be wrong for certain: the one that fits the vectors around it is kept, as a whole.
 
 Axes: arrays `[z, y, x]`, components last; displacements in voxels.
 """
@@ -19,6 +19,7 @@ from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
+from scipy.ndimage import uniform_filter
 from scipy.spatial import KDTree
 
 from lfpiv_cli.arrays import Flags, Floats, Integers
@@ -106,7 +107,7 @@ def combine(first: VectorField, second: VectorField) -> Combined:
     # Of two that cannot be weighed the first one is taken.
     used[1] &= ~(used.all(axis=0) & (ranks[0] < WEIGHED))
     both = used.all(axis=0)
-    widened = _widening(values[0] - values[1], stated, both)
+    widened = _widening_of_all(values[0] - values[1], stated, both)
     sigma = stated * widened[:, np.newaxis, np.newaxis, np.newaxis]
     apart = np.abs(values[0] - values[1]) / np.hypot(*sigma)
     disagreement = np.where(both, apart.max(axis=-1), np.nan)
@@ -115,6 +116,7 @@ def combine(first: VectorField, second: VectorField) -> Combined:
     second_is_kept = _second_fits_better(values, sigma, used, left_out, masked)
     used[0] &= ~(left_out & second_is_kept)
     used[1] &= ~(left_out & ~second_is_kept)
+    sigma = sigma * _widening_around(apart, sigma, both)
     displacement, share = _mean(values, sigma, used)
     flag = np.where(used[0], first.flag, np.where(used[1], second.flag, REJECTED))
     flag = np.where(used.all(axis=0), VALID, np.where(masked, MASKED, flag))
@@ -154,7 +156,7 @@ def _spread(difference: Floats) -> Floats:
     return np.asarray(np.quantile(np.abs(difference), SPREAD_SHARE, axis=0) / SPREAD_SIGMAS)
 
 
-def _widening(difference: Floats, stated: Floats, both: Flags) -> Floats:
+def _widening_of_all(difference: Floats, stated: Floats, both: Flags) -> Floats:
     """Return the factors (2, 3), one or more, with which the uncertainties of two fields explain their differences.
 
     What is missing in the variance is shared as the squares of the stated variances: alike between equals, and almost
@@ -165,8 +167,32 @@ def _widening(difference: Floats, stated: Floats, both: Flags) -> Floats:
     variance = stated[:, both] ** 2
     total = variance.sum(axis=0)
     spread = _spread(difference[both] / np.sqrt(total))
-    share = np.median(variance / total, axis=1)
-    return np.asarray(np.sqrt(1.0 + np.maximum(spread**2 - 1.0, 0.0) * share / np.sum(share**2, axis=0)))
+    return _widening(spread**2, np.median(variance / total, axis=1))
+
+
+def _widening_around(apart: Floats, sigma: Floats, both: Flags) -> Floats:
+    """Return the factors (2, nz, ny, nx, 3), one or more, that explain the differences about each vector.
+
+    Where a volume's light is worse than its correlation knows, as near the focal plane, neighbours err alike.
+
+    Parameters
+    ----------
+    apart : (nz, ny, nx, 3) differences over their standard deviations
+    """
+    counted = both[..., np.newaxis]
+    # One that cannot be right says little of those around it.
+    squares = np.where(counted, np.minimum(apart, LARGEST_DISAGREEMENT), 0.0) ** 2
+    of_squares, of_counted = (
+        uniform_filter(values, (3, 3, 3, 1), mode="constant") for values in (squares, counted.astype(np.float64))
+    )
+    mean = of_squares / np.where(counted, of_counted, 1.0)
+    variance = np.where(counted, sigma**2, 1.0)
+    return np.where(counted, _widening(mean, variance / variance.sum(axis=0)), 1.0)
+
+
+def _widening(spread2: Floats, share: Floats) -> Floats:
+    """Return the factors for variances of differences over the stated ones, by each field's share (2, …) of these."""
+    return np.asarray(np.sqrt(1.0 + np.maximum(spread2 - 1.0, 0.0) * share / np.sum(share**2, axis=0)))
 
 
 def _mean(values: Floats, sigma: Floats, used: Flags) -> tuple[Floats, Floats]:
