@@ -154,26 +154,27 @@ def separated(task: Task, state: State, settings: Round, to_noise: bool) -> tupl
             state = accepted(task, state, candidates, replace(settings, unexplained=LAST_UNEXPLAINED))
             sweep(task, state, LAST_UNEXPLAINED, LAST_SWEEPS)
             found = len(state.particles) > before
-        # What could not be moved may be with the noise that is measured first.
-        state = replace(state, unmoved=state.unmoved if check else state.unmoved[:0])
+        # What could not be moved may be with the noise that is measured first, and what could not be split any time.
+        state = replace(state, unmoved=state.unmoved if check else state.unmoved[:0], unsplit=state.unsplit[:0])
         fits = judged(task, state, LAST_UNEXPLAINED)
         good = good_chi2(fits.chi2)
         if to_noise and good > max(NEXT_TO_NOISE, LEAST_PROGRESS * good_before):
             break
         fainter = usual_light(state, fits, BRIGHTER_PERCENTILE) or state.typical_light
         state = replace(state, typical_light=min(state.typical_light, fainter))
-        state = with_suspects_tried(task, state, fits, 1.0 if to_noise else good)
+        state = with_suspects_tried(task, state, fits, LAST_UNEXPLAINED, 1.0 if to_noise else good)
         if check > 0 and len(state.particles) - before <= HARDLY_ANY * before:
             break
     return state, good
 
 
-def with_suspects_tried(task: Task, state: State, fits: Fits, good: float) -> State:
-    """Return the state after all that fit worse than `good` were tried at other depths, and all as two again."""
-    state = with_depths_corrected(task, state, fits.chi2, LAST_UNEXPLAINED, good)
-    # What could not be split may be now.
-    state = replace(state, unsplit=state.unsplit[:0])
-    return with_overlaps_split(task, state, fits.chi2, LAST_UNEXPLAINED, good, thorough=True)
+def with_suspects_tried(
+    task: Task, state: State, fits: Fits, unexplained: float, good: float, thorough: bool = True
+) -> State:
+    """Return the state after all that fit worse than `good` were tried as two, and before that at other depths."""
+    if thorough:
+        state = with_depths_corrected(task, state, fits.chi2, unexplained, good)
+    return with_overlaps_split(task, state, fits.chi2, unexplained, good, thorough)
 
 
 def concluded(task: Task, state: State, settings: Round, joins: int = 1) -> State:
@@ -190,7 +191,8 @@ def concluded(task: Task, state: State, settings: Round, joins: int = 1) -> Stat
             break
         sweep(task, state, LAST_UNEXPLAINED, LAST_SWEEPS)
         fits = judged(task, state, LAST_UNEXPLAINED)
-        state = with_suspects_tried(task, state, fits, good_chi2(fits.chi2))
+        state = replace(state, unsplit=state.unsplit[:0])
+        state = with_suspects_tried(task, state, fits, LAST_UNEXPLAINED, good_chi2(fits.chi2))
     return pruned(task, state, settings)[0]
 
 
@@ -244,10 +246,7 @@ def with_suspects_checked(task: Task, state: State, fits: Fits, settings: Round)
 
     `fits` says how well they fit; returned is how well those do that stay.
     """
-    good = good_chi2(fits.chi2)
-    if settings.thorough:
-        state = with_depths_corrected(task, state, fits.chi2, settings.unexplained, good)
-    state = with_overlaps_split(task, state, fits.chi2, settings.unexplained, good, settings.thorough)
+    state = with_suspects_tried(task, state, fits, settings.unexplained, good_chi2(fits.chi2), settings.thorough)
     sweep(task, state, settings.unexplained, SWEEPS_AFTER_SPLIT, SEARCH_GAIN)
     return pruned(task, with_twins_joined(task, state, settings.unexplained, fits.chi2), settings)
 
