@@ -209,8 +209,8 @@ def fit_rays(
         return first
     better = better.with_micro_images(camera.micro_image_lattice_px())
     again = _fit_as_seen_by(better, images, depths_mm, board, media, transmission)
-    pupil = {name: getattr(first, name) for name in ("entrance_pupil_mm", "entrance_pupil_sigma_mm")}
-    return replace(again, **pupil)
+    pupil_mm, sigma_mm = first.entrance_pupil_mm, first.entrance_pupil_sigma_mm
+    return replace(again, entrance_pupil_mm=pupil_mm, entrance_pupil_sigma_mm=sigma_mm)
 
 
 def _fit_as_seen_by(

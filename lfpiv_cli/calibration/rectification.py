@@ -24,7 +24,6 @@ from lfpiv_cli.optics.camera import Lattice, nearest_point
 from lfpiv_cli.optics.line_responses import spline_weights
 from lfpiv_cli.threads import share_out
 
-EXPONENT_ARRAY = np.array(EXPONENTS, dtype=np.int64)
 # A pixel counts in the coefficients of a cubic spline so far away by less than rounding of single precision.
 SPLINE_REACH_PX = 16
 
@@ -66,7 +65,7 @@ class Rectification:
         """
         shift = np.empty((*self.image_shape, 2), dtype=np.float32)
         upright, turn = self.lattice_px, turn_matrix(self.rotation_rad)
-        model = (self.fit.coefficients_px, EXPONENT_ARRAY)
+        model = (self.fit.coefficients_px, np.array(EXPONENTS, dtype=np.int64))
         share_out(write_shift, self.image_shape[0], upright.origin, upright.basis, model, turn, shift)
         return shift
 

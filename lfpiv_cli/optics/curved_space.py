@@ -339,13 +339,6 @@ class CurvedSpace:
             reliefs=reliefs_of(heights) if any(heights) else None,
         )
 
-    def distance(self, camera: Camera, z_mm: ArrayLike) -> Floats:
-        """Return how far from the lens, in air, points on the optical axis would appear behind planes at the vertices.
-
-        What `ObjectSpace.distance` gives for planes; along a cylinder's axis it is the apparent distance.
-        """
-        return camera.focus_distance_mm + self.media.depth_ratio * np.asarray(z_mm, dtype=np.float64)
-
     def slopes(self, camera: Camera, points_mm: ArrayLike, crossing_mm: ArrayLike) -> tuple[Floats, Flags]:
         """Return the slopes (n, 2) at the lens of the rays from points (n, 3) that cross it at (n, 2), if they do."""
         crossing = _rows(crossing_mm, 2)
