@@ -159,11 +159,6 @@ class BoardGeometry:
     marker_mm: float = 0.0
     dictionary: str = "DICT_4X4_50"
 
-    @property
-    def points(self) -> str:
-        """What its points are called."""
-        return "dots" if self.pattern == "dots" else "corners"
-
     def seen_through(self, media: Media) -> Media:
         """Return what is in front of it."""
         return media.in_air() if self.medium == "air" else media
@@ -373,8 +368,9 @@ def refuse_few(count: int, board: BoardGeometry) -> None:
     share = 0.0 if board.pattern == "charuco" else LEAST_SHARE
     needed = max(FEWEST_DOTS, int(np.ceil(share * across * down)))
     if count < needed:
+        points = "dots" if board.pattern == "dots" else "corners"
         raise InputError(
-            f"only {count} of the board's {across} x {down} {board.points} were found, {board.spacing_mm:g} mm apart, "
+            f"only {count} of the board's {across} x {down} {points} were found, {board.spacing_mm:g} mm apart, "
             f"at least {needed} are needed; check the section board, the exposure and the focus"
         )
 

@@ -210,11 +210,6 @@ class Photographs:
     depths_mm: Sequence[float] = ()
     mid_plane_z_mm: float | None = None
 
-    @property
-    def lit(self) -> list[ArrayLike]:
-        """All but the dark one."""
-        return [*self.whites, *([] if self.board is None else [self.board]), *self.depth_boards]
-
     def less_dark(self, picture: ArrayLike) -> Floats:
         """Return a picture with the dark one taken off."""
         image = np.asarray(picture, dtype=np.float64)
@@ -250,7 +245,8 @@ def calibrate(pictures: Photographs, rig: Rig | None = None, sheet: DataSheet = 
     ------
     InputError : when a picture cannot serve; it says why
     """
-    shapes = [np.shape(picture) for picture in pictures.lit]
+    lit = [*pictures.whites, *([] if pictures.board is None else [pictures.board]), *pictures.depth_boards]
+    shapes = [np.shape(picture) for picture in lit]
     shapes += [] if sheet.camera is None else [(sheet.camera.rows, sheet.camera.columns)]
     if len(set(shapes)) != 1 or len(shapes[0]) != 2:
         raise InputError(f"the pictures are {', '.join(map(str, shapes))} (rows, columns), expected all of one shape")
