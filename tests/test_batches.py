@@ -17,7 +17,7 @@ import tifffile
 
 from lfpiv_cli.errors import InputError, OutputExistsError, PartialError, UsageError
 from lfpiv_cli.files import atomic
-from lfpiv_cli.files.atomic import DEAD_AFTER_S, EventLog, claim_path, claimed, ignores_case
+from lfpiv_cli.files.atomic import DEAD_AFTER_S, EventLog, claimed, ignores_case
 from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, read_points
 from lfpiv_cli.files.vtkhdf import open_volume
 from tests.commands import CONFIG, ROOT, SAMPLE, run, sample_weights, summary_of
@@ -184,6 +184,12 @@ def claims_in(folder: Path) -> list[str]:
     return [path.name for path in folder.glob(".*.claim")]
 
 
+def claim_of(target: Path) -> Path:
+    with claimed(target):
+        (name,) = claims_in(target.parent)
+    return target.with_name(name)
+
+
 @pytest.mark.thorough
 def test_what_another_worker_makes_is_left_to_it(weights, images, tmp_path, capsys) -> None:
     command = ("reconstruct", weights, *images, *QUICK, "-o")
@@ -213,7 +219,7 @@ def test_what_another_worker_makes_is_left_to_it(weights, images, tmp_path, caps
 def test_the_claim_of_a_dead_worker_is_taken_over(weights, images, tmp_path, capsys, fate) -> None:
     dead = subprocess.Popen([sys.executable, "-c", ""])
     dead.wait()
-    claim = claim_path(tmp_path / "f0.vtkhdf")
+    claim = claim_of(tmp_path / "f0.vtkhdf")
     host = socket.gethostname() if fate == "dead" else "another"
     claim.write_text("" if fate == "half written" else json.dumps({"host": host, "process": dead.pid}))
     if fate != "dead":
@@ -224,7 +230,7 @@ def test_the_claim_of_a_dead_worker_is_taken_over(weights, images, tmp_path, cap
 
 
 def test_a_living_worker_is_respected_and_shows_that_it_is_alive(tmp_path, monkeypatch) -> None:
-    claim = claim_path(tmp_path / "f0.vtkhdf")
+    claim = claim_of(tmp_path / "f0.vtkhdf")
     for host, process in ((socket.gethostname(), os.getpid()), ("another", 1)):
         claim.write_text(json.dumps({"host": host, "process": process}))
         with claimed(tmp_path / "f0.vtkhdf") as granted:
@@ -232,9 +238,9 @@ def test_a_living_worker_is_respected_and_shows_that_it_is_alive(tmp_path, monke
         assert claim.exists()
     # A worker shows that it is alive.
     monkeypatch.setattr(atomic, "TOUCHED_EVERY_S", 0.01)
-    with claimed(tmp_path / "x.vtkhdf") as granted:
+    claim.unlink()
+    with claimed(tmp_path / "f0.vtkhdf") as granted:
         assert granted
-        claim = claim_path(tmp_path / "x.vtkhdf")
         os.utime(claim, (0, 0))
         for _ in range(500):
             if claim.stat().st_mtime > 0:

@@ -331,7 +331,10 @@ def claimed(target: Path) -> Iterator[bool]:
     ------
     OutputError : the folder takes no file, or cannot be made
     """
-    claim, granted, ended = claim_path(target), False, threading.Event()
+    # Beside it, under a name that is not longer than the system allows.
+    digest = hashlib.sha256(os.fsencode(target.name)).hexdigest()[:8]
+    claim = target.with_name(f".{target.stem[:KEPT_CHARACTERS]}.{digest}.claim")
+    granted, ended = False, threading.Event()
 
     def keep_touching() -> None:
         while not ended.wait(TOUCHED_EVERY_S):
@@ -362,12 +365,6 @@ def awaited(target: Path) -> Iterator[None]:
                 yield
                 return
         time.sleep(SECONDS_BETWEEN_LOOKS)
-
-
-def claim_path(target: Path) -> Path:
-    """Return where the claim of an output lies: beside it, under a name that is not longer than the system allows."""
-    digest = hashlib.sha256(os.fsencode(target.name)).hexdigest()[:8]
-    return target.with_name(f".{target.stem[:KEPT_CHARACTERS]}.{digest}.claim")
 
 
 def _create(claim: Path) -> bool:

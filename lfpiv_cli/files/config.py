@@ -22,7 +22,7 @@ from lfpiv_cli.files.checks import validated
 from lfpiv_cli.files.sections import UM_TO_MM, PipeSection, scene_of
 from lfpiv_cli.files.sections_work import Sections, flow_of
 from lfpiv_cli.files.yaml_nodes import Document, read_rig
-from lfpiv_cli.flow.windows import CorrelationSettings, ParallelWalls, Walls
+from lfpiv_cli.flow.windows import CorrelationSettings, ParallelWalls, Triple, Walls
 from lfpiv_cli.grid import FOCAL_POINT, Grid, Reference
 from lfpiv_cli.names import Refraction
 from lfpiv_cli.optics.camera import Camera
@@ -42,7 +42,6 @@ DEFAULT_WINDOW = 16
 SMALLEST_DEFAULT_WINDOW = 8
 SMALLEST_WINDOW = 4
 
-Triple = tuple[int, int, int]
 Lengths = tuple[float, float, float]
 
 

@@ -36,27 +36,27 @@ class Format:
     name : as people say it
     starts : the first bytes of its files, where they tell
     suffixes : of its files' names, in small letters, where the first bytes do not tell
-    frames : reads a file's header
-    frames_of : reads what FILE:PART says of a file, where the format has parts
+    frames : reads a file's header, and with it what FILE:PART says, where the format has parts
+    has_parts : whether it has parts, or layouts, to name
     beside : finds the other files that one is read with; a folder stands for all files in it
     in_folders : whether its files are meant where a folder is given for the images in it; an HDF5 file can be anything,
         and a set's images are there besides
     """
 
     name: str
-    frames: Callable[[Path], Recording]
+    frames: Callable[..., Recording]
     starts: tuple[bytes, ...] = ()
     suffixes: tuple[str, ...] = ()
-    frames_of: Callable[[Path, str], Recording] | None = None
+    has_parts: bool = False
     beside: Callable[[Path], tuple[Path, ...]] | None = None
     in_folders: bool = True
 
 
-RAW = Format("raw", raw_frames, suffixes=SUFFIXES, frames_of=raw_frames)
+RAW = Format("raw", raw_frames, suffixes=SUFFIXES, has_parts=True)
 FORMATS = (
     Format("TIFF", formats.tiff_frames, starts=formats.TIFF_STARTS),
     Format("PNG", formats.png_frames, starts=(formats.PNG_START,)),
-    Format("HDF5", formats.hdf5_frames, starts=(formats.HDF5_START,), frames_of=formats.hdf5_frames, in_folders=False),
+    Format("HDF5", formats.hdf5_frames, starts=(formats.HDF5_START,), has_parts=True, in_folders=False),
     Format("Phantom cine", cameras.cine_frames, starts=(cameras.CINE_START,)),
     Format("Norpix seq", cameras.seq_frames, starts=(cameras.SEQ_START,)),
     Format("Photron mraw", cameras.mraw_frames, suffixes=(cameras.MRAW_SUFFIX,), beside=cameras.header_beside),
@@ -135,12 +135,9 @@ def _frames(file: Path, part: str | None, states: tuple[tuple[int, int, int], ..
     """Read a header once; a file that has another size, time or place on the disk is looked at anew."""
     part, page = split_page(part)
     found = format_of(file, part)
-    if part is None:
-        recording = found.frames(file)
-    elif found.frames_of is None:
+    if part is not None and not found.has_parts:
         raise UsageError(f"{file}:{part}: {found.name} files have no parts or layouts to name")
-    else:
-        recording = found.frames_of(file, part)
+    recording = found.frames(file) if part is None else found.frames(file, part)
     if page is None:
         return recording
     if page >= recording.pages:

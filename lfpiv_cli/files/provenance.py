@@ -138,12 +138,7 @@ def without_warnings(made: Mapping[str, Any]) -> dict[str, Any]:
 
 def replace_provenance(path: Path, provenance: Mapping[str, Any]) -> None:
     """Give a file another record, its data as they are."""
-
-    def check(temporary: Path) -> None:
-        with open_h5(temporary) as file:
-            read_provenance(file)
-
-    with written_atomically(path, overwrite=True, check=check) as temporary:
+    with written_atomically(path, overwrite=True, check=carried_record) as temporary:
         shutil.copyfile(path, temporary)
         with h5py.File(temporary, "r+", libver=LIBRARY_VERSIONS) as file:
             file.attrs["provenance"] = np.bytes_(json.dumps(provenance, allow_nan=False))

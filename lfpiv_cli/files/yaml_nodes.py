@@ -334,10 +334,8 @@ MOST_HEIGHTS = 2**14
 DIGITS = 9
 SEPARATORS = re.compile(r"[,;\s]+")
 
-Rows = tuple[tuple[float, ...], ...]
 
-
-def read_heights(path: Path) -> Rows:
+def read_heights(path: Path) -> tuple[tuple[float, ...], ...]:
     """Read rows of heights in mm: a table of numbers (text), an array (.npy), or an image (.tif).
 
     Raises
@@ -346,29 +344,27 @@ def read_heights(path: Path) -> Rows:
     """
     ensure_regular_file(path)
     ending = path.suffix.lower()
+    array: NDArray[Any] | None = None
     if ending in (".tif", ".tiff"):
-        rows = _rows_of(read_single(path), path)
+        array = read_single(path)
     elif ending == ".npy":
         try:
-            array = np.load(path, mmap_mode="r", allow_pickle=False)  # its size is held against the file's
+            # Its size is held against the file's.
+            array = np.asarray(np.load(path, mmap_mode="r", allow_pickle=False))
         except Exception as error:  # a damaged header can raise anything in NumPy
             raise InputError(f"{path}: is no NumPy array: {reason(error)}") from error
-        rows = _rows_of(np.asarray(array), path)
+    if array is None:
+        rows = list(_table(path))
     else:
-        rows = tuple(_table(path))
+        if array.ndim != 2 or array.dtype.kind not in "fiu":
+            raise InputError(f"{path}: is {array.dtype} of the shape {array.shape}, expected numbers (rows, columns)")
+        _ensure_few(array.size, path)
+        rows = array.astype(np.float64).tolist()
     bad = [(r, c) for r, row in enumerate(rows, start=1) for c, z in enumerate(row, start=1) if not math.isfinite(z)]
     if bad:
         row, column = bad[0]
         raise InputError(f"{path}: {len(bad)} heights are no numbers, the first one in row {row}, column {column}")
     return tuple(tuple(round(z, DIGITS) for z in row) for row in rows)
-
-
-def _rows_of(array: NDArray[Any], path: Path) -> Rows:
-    """Return an array (rows, columns) as rows."""
-    if array.ndim != 2 or array.dtype.kind not in "fiu":
-        raise InputError(f"{path}: is {array.dtype} of the shape {array.shape}, expected numbers (rows, columns)")
-    _ensure_few(array.size, path)
-    return tuple(tuple(row) for row in array.astype(np.float64).tolist())
 
 
 def _table(path: Path) -> Iterator[tuple[float, ...]]:

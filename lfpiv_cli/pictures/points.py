@@ -114,14 +114,10 @@ def convergence_figure(pairs: Integers, velocity: Floats, stress: Floats) -> sty
     """
     factor, unit = speed_unit(velocity)
     figure, axes = style.new_panels(8.4, 3.6, 1, 2)
+    products = [f"<{name[0]}'{name[1]}'>" for name in STRESSES]
     each = (
         (axes[0], factor * velocity, style.COMPONENT_NAMES, f"scatter of means ({unit})"),
-        (
-            axes[1],
-            factor**2 * stress,
-            [f"<{name[0]}'{name[1]}'>" for name in STRESSES],
-            f"scatter of stresses ({unit})²",
-        ),
+        (axes[1], factor**2 * stress, products, f"scatter of stresses ({unit})²"),
     )
     for panel, values, names, label in each:
         for k, name in enumerate(names):
@@ -373,7 +369,7 @@ LEAST_SIDE = 0.1
 # From where it is seen, as the still picture: depth to the right, y up. A box that is longer than a cube of its
 # volume is seen from farther, by this power of it.
 FARTHER = 0.6
-EYE, LOOKED_AT = np.array([-1.4, 1.05, 1.0]), {"x": 0, "y": -0.28, "z": 0}
+EYE = np.array([-1.4, 1.05, 1.0])
 
 
 def has_views() -> bool:
@@ -458,11 +454,8 @@ def lines_view(lines: Lines, walls: Walls | None = None, *, name: str = "view", 
     if sides.any():
         farther = (sides.max() / np.prod(np.maximum(sides, LEAST_SIDE * sides.max())) ** (1.0 / 3.0)) ** FARTHER
     axes = {f"{axis}axis": {"title": f"{axis} (mm)"} for axis in "xyz"}
-    scene = {
-        **axes,
-        "aspectmode": "data",
-        "camera": {"up": {"x": 0, "y": 1, "z": 0}, "eye": _along_axes(farther * EYE)},
-    }
+    camera = {"up": {"x": 0, "y": 1, "z": 0}, "eye": _along_axes(farther * EYE)}
+    scene = {**axes, "aspectmode": "data", "camera": camera}
     margin = {"l": 0, "r": 0, "t": 30, "b": 0}
     figure.update_layout(scene=scene, height=HEIGHT_PX, showlegend=False, margin=margin)
     how: dict[str, Any] = {"full_html": False, "include_plotlyjs": with_script, "div_id": name}

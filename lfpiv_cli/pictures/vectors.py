@@ -290,15 +290,13 @@ def sigma_figure(field: VectorField) -> style.Figure:
     low, high = np.percentile(known, SCALE_PERCENT) if known.size else (0.1, 1.0)
     if low == high:
         low, high = 0.5 * low, 2.0 * high
-    label, scale = (
-        f"stated standard deviation ({quantity.unit})",
-        {"cmap": style.SEQUENTIAL, "norm": LogNorm(low, high)},
-    )
-    each = [
-        ([quantity.sigma[..., component]] * 3, [f"σ of {name}"] * 3)
+    label = f"stated standard deviation ({quantity.unit})"
+    scale = {"cmap": style.SEQUENTIAL, "norm": LogNorm(low, high)}
+    rows = [
+        MapRow([quantity.sigma[..., component]] * 3, [f"σ of {name}"] * 3, label, scale)
         for component, name in enumerate(style.COMPONENT_NAMES)
     ]
-    return maps_figure(field.grid, [MapRow(maps, titles, label, scale) for maps, titles in each])
+    return maps_figure(field.grid, rows)
 
 
 @style.styled
@@ -323,9 +321,8 @@ def flags_figure(field: VectorField) -> style.Figure:
 
 def quality_figure(field: VectorField, names: dict[str, Floats]) -> style.Figure:
     """Return maps of quantities [z, y, x] that tell how good vectors are (rows), each on its own scale."""
-    scales = [middle_scale([values] * 3) for values in names.values()]
-    each = zip(names.items(), scales, strict=True)
-    return maps_figure(field.grid, [MapRow([values] * 3, [""] * 3, name, scale) for (name, values), scale in each])
+    each = ((name, [values] * 3) for name, values in names.items())
+    return maps_figure(field.grid, [MapRow(maps, [""] * 3, name, middle_scale(maps)) for name, maps in each])
 
 
 @style.styled
