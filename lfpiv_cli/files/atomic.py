@@ -27,7 +27,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from lfpiv_cli.errors import InputError, LfpivError, OutputError, OutputExistsError, UsageError
+from lfpiv_cli.errors import InputError, OutputError, OutputExistsError, UsageError
 from lfpiv_cli.files.inputs import reason, split_part
 
 # Where the files of a command lie: no two outputs in one place, and none in that of an input.
@@ -247,8 +247,6 @@ def written_atomically(
             os.replace(temporary, target)
             with contextlib.suppress(OSError):  # Windows cannot open folders
                 _flush(target.parent, os.O_RDONLY)
-        except LfpivError:
-            raise
         except OSError as error:
             raise OutputError(f"{target}: cannot be written: {reason(error)}") from error
         finally:

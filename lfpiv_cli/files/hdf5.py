@@ -26,7 +26,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from lfpiv_cli.errors import InputError, LfpivError, OutputError
+from lfpiv_cli.errors import InputError, OutputError
 from lfpiv_cli.files.atomic import written_atomically
 from lfpiv_cli.files.inputs import ensure_regular_file, physical_memory, reason
 
@@ -220,8 +220,6 @@ def open_h5(path: Path, format_name: str | None = None, format_version: int = 1)
                     ours = f"this program reads {format_version}"
                     raise InputError(f"{path}: has {format_name} version {version}, {ours}{remedy}")
             yield file
-    except LfpivError:
-        raise
     except BROKEN_FILE_ERRORS as error:
         raise InputError(f"{path}: not a readable HDF5 file of ours: {reason(error)}") from error
 

@@ -57,9 +57,6 @@ def write_pdf(path: Path, figures: Iterable[Figure], overwrite: bool) -> None:
             pages.savefig(figure)
 
 
-TEMPLATES = Path(__file__).with_name("templates")
-
-
 @dataclass(frozen=True)
 class Table:
     """A table of text; cells that are verdicts (met, missed, unknown; good, look, no) are coloured."""
@@ -117,7 +114,7 @@ def write_pages(page: Page, targets: Iterable[Path], overwrite: bool) -> None:
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
     places = Environment(
-        loader=FileSystemLoader(TEMPLATES),
+        loader=FileSystemLoader(Path(__file__).with_name("templates")),
         autoescape=lambda name: name is not None and name.endswith(".html"),
         undefined=StrictUndefined,
         trim_blocks=True,

@@ -277,8 +277,7 @@ def walls_figure(refinement: Refinement) -> style.Figure:
     half = 0.5 * walls.width_mm
     searched = refinement.depths_mm[1] - refinement.depths_mm[0]
     figure, ((whole, across), (near, far)) = style.new_panels(12.0, 8.0, 2, 2)
-    limits = (0.5 * searched * np.array([-1.0, 1.0])).tolist()
-    _draw_depths(whole, refinement, depth, (limits[0], limits[1]), BARS)
+    _draw_depths(whole, refinement, depth, (-0.5 * searched, 0.5 * searched), BARS)
     expected = (refinement.expected_z_mm or 0.0) - walls.middle_mm
     for side in (-1.0, 1.0):
         before = expected + side * 0.5 * refinement.width_mm
@@ -289,9 +288,8 @@ def walls_figure(refinement: Refinement) -> style.Figure:
         zoom = ZOOM_PER_WIDTH * refinement.width_mm
         _draw_depths(axes, refinement, depth, (side * half - zoom, side * half + zoom), BARS_AT_WALL)
         axes.set_title(f"{name} wall, at z = {walls.middle_mm + side * half:z.3f} mm on the axis")
-    position = refinement.position_mm
-    across.plot(position[:, 0], position[:, 2], ",", color=style.SKY_BLUE)
-    x = np.array([position[:, 0].min(), position[:, 0].max()])
+    across.plot(place[:, 0], place[:, 2], ",", color=style.SKY_BLUE)
+    x = np.array([place[:, 0].min(), place[:, 0].max()])
     for end in (-0.5, 0.5):
         across.plot(x, walls.middle_mm + end * walls.width_mm + walls.slope[0] * x, color=style.VERMILION)
     across.set(xlabel="x (mm)", ylabel="z (mm)", title="from the side, and the walls at y = 0")

@@ -228,8 +228,7 @@ def depths_figure(z_mm: Floats, light_counts: Floats, covariance_mm2: Floats) ->
 
     Light by its median and quartiles.
     """
-    figure = style.new_figure(11.0, 3.6)
-    counts, light, sigmas = figure.subplots(1, 3)
+    figure, (counts, light, sigmas) = style.new_panels(11.0, 3.6, 1, 3)
     counts.hist(z_mm, bins=style.slab_edges(z_mm), color=style.BLUE)
     counts.set(xlabel=style.DEPTH_LABEL, ylabel="particles")
     style.draw_medians(light, z_mm, {"light": light_counts}, "light of a particle (counts), median")
@@ -316,8 +315,8 @@ def space_figure(lines: list[Floats], speed_m_s: Floats, what: str) -> style.Fig
 @style.styled
 def velocities_figure(velocity_m_s: Floats) -> style.Figure:
     """The velocity components."""
-    figure = style.new_figure(10.0, 3.2)
-    for component, axes in enumerate(figure.subplots(1, 3)):
+    figure, panels = style.new_panels(10.0, 3.2, 1, 3)
+    for component, axes in enumerate(panels):
         axes.hist(velocity_m_s[:, component], bins=HISTOGRAM_BARS, color=style.COLOURS[component])
         axes.set(xlabel=f"{style.COMPONENT_NAMES[component]} (m/s)", ylabel="tracks")
     return figure
