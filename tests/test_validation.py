@@ -248,7 +248,8 @@ def test_ssim_eq_16_and_figures_of_a_column_by_hand(rng):
     assert normalised_correlation(volume, np.zeros_like(volume)) == 0.0
     reference = np.array([[0.5, 0.25], [0.25, 0.0]])
     image = np.array([[0.5, 0.25], [0.15, 0.1]])
-    figures = weights.compare_columns(reference, image)
+    column = Column((0.0, 0.0, 1.0), {"ert": reference, "factorised": image})
+    figures = weights_figures([column], np.array([0]))["voxels"][0]["factorised_to_converged"]
     assert figures["l1"] == pytest.approx(0.2)
     assert figures["rmse_grey"] == pytest.approx(510.0 * np.sqrt(0.02 / 4))
     figures = {"a.ssim_smallest": 0.9, "a.l1_mean": 0.02}

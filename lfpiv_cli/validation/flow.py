@@ -203,18 +203,6 @@ def _mean_error(measured_sum: float, true_sum: float) -> float | None:
     return measured_sum / true_sum - 1.0 if true_sum > 0.0 else None
 
 
-def streamwise_mean_error_at(measured: Measured, axis: int, position_mm: float) -> float | None:
-    """Return the streamwise mean error of a slice across an axis (0 for x), between planes of windows if need be.
-
-    The sums of v and of u, not their ratio, are interpolated; beyond the outer planes the outer one is taken.
-    """
-    field, pairs = measured.field, measured.pairs
-    plane = pairs.index_zyx[:, 2 - axis]
-    sums = np.array([_streamwise_sums(pairs, plane == k) for k in range(field.grid.shape_xyz[axis])])
-    v, u = (float(np.interp(position_mm, field.grid.axis_mm(axis), each)) for each in sums.T)
-    return _mean_error(v, u)
-
-
 def cumulative_distribution(pairs: Comparison) -> dict[str, Any]:
     """Return the shares of all windows whose relative error is at most 0, 1, ... 100 per cent (the paper's Fig. 18)."""
     limits = np.linspace(0.0, 1.0, CUMULATIVE_STEPS)
@@ -325,19 +313,23 @@ class Duct:
 def table_4(measured: Measured, duct: Duct) -> dict[str, Any]:
     """Return the sizes of the mean velocity errors in per cent, of the six slices and of the whole, beside the paper's.
 
-    By the slice (`overall`, `z/D 0.3` ...): `ours`, `paper_dlfc` and `paper_ert`. A slice between planes of windows is
-    interpolated; ours is None where it has none.
+    By the slice (`overall`, `z/D 0.3` ...): `ours`, `paper_dlfc` and `paper_ert`. Of a slice between planes of windows
+    the sums of v and of u, not their ratio, are interpolated; beyond the outer planes the outer one is taken. Ours is
+    None where it has none.
     """
-    pairs = measured.pairs
+    grid, pairs = measured.field.grid, measured.pairs
     found = pairs.measured[pairs.found].sum(axis=0), pairs.true[pairs.found].sum(axis=0)
     overall = None
     if pairs.direction is not None and pairs.found.any():
         overall = float(found[0] @ pairs.direction / (found[1] @ pairs.direction) - 1.0)
     table = {"overall": _row(overall, *PAPER_OVERALL)}
     for name, axis in duct.across.items():
+        plane = pairs.index_zyx[:, 2 - axis]
+        sums = np.array([_streamwise_sums(pairs, plane == k) for k in range(grid.shape_xyz[axis])])
         for share, paper in PAPER_SLICES[name].items():
-            error = streamwise_mean_error_at(measured, axis, duct.position_mm(axis, share))
-            table[f"{name} {share}"] = _row(error, *paper)
+            position = duct.position_mm(axis, share)
+            v, u = (float(np.interp(position, grid.axis_mm(axis), each)) for each in sums.T)
+            table[f"{name} {share}"] = _row(_mean_error(v, u), *paper)
     return table
 
 

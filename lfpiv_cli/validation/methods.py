@@ -179,8 +179,10 @@ def slices_figure(methods: Mapping[str, Measured], duct: Duct) -> style.Figure:
     tables = {name: table_4(m, duct) for name, m in methods.items()}
     main = style.AXIS_NAMES.index(duct.axis)
     for row, (name, axis) in zip(axes, duct.across.items(), strict=True):
+        # of what a slice leaves of [z, y, x], the one that the flow follows
+        along, other = [k for k in (2, 1, 0) if k != axis].index(main), 3 - axis - main
         for panel, share in zip(row, PAPER_SLICES[name], strict=True):
-            position, other = duct.position_mm(axis, share), 3 - axis - main
+            position = duct.position_mm(axis, share)
             panel.axhline(0.0, color=style.GREY, linewidth=0.8)
             if first.flow is not None:
                 # as far as the walls
@@ -189,9 +191,9 @@ def slices_figure(methods: Mapping[str, Measured], duct: Duct) -> style.Figure:
                 points[:, axis], points[:, other] = position, places
                 panel.plot(places, first.flow(points)[:, main], color=style.BLACK, label="true, analytic")
             for (label, values), colour, marker in zip(curves.items(), style.COLOURS, style.MARKERS, strict=False):
-                profile = profile_at(values[..., main], first.field.grid.axis_mm(axis), position, axis, main)
+                of_slice = slice_at(values[..., main], first.field.grid.axis_mm(axis), position, axis)
                 look = {"color": colour, "markerfacecolor": "none", "label": label}
-                panel.plot(first.field.grid.axis_mm(other), profile, marker, **look)
+                panel.plot(first.field.grid.axis_mm(other), mean_of_known(of_slice, (along,)), marker, **look)
             rows = {method: table[f"{name} {share}"] for method, table in tables.items()}
             ours = {method: errors["ours_percent"] for method, errors in rows.items()}
             errors = [f"{name} unknown" if e is None else f"{name} {e:.2f} %" for name, e in ours.items()]
@@ -202,13 +204,6 @@ def slices_figure(methods: Mapping[str, Measured], duct: Duct) -> style.Figure:
             panel.set(xlabel=f"{style.AXIS_NAMES[other]} (mm)", ylabel=f"{style.COMPONENT_NAMES[main]} (m/s)")
     axes[0, 0].legend()
     return figure
-
-
-def profile_at(values: Floats, places: Floats, position: float, axis: int, along: int) -> Floats:
-    """Return a slice across one axis (0 for x) of values [z, y, x], interpolated, and its mean along another."""
-    # what is left of [z, y, x] once the first axis is taken
-    left = [k for k in (2, 1, 0) if k != axis].index(along)
-    return mean_of_known(slice_at(values, places, position, axis), (left,))
 
 
 def slice_at(values: Floats, places: Floats, position: float, axis: int) -> Floats:

@@ -97,16 +97,6 @@ def ssim(reference: Floats, image: Floats) -> float:
     return float(np.mean(above / below))
 
 
-def compare_columns(reference: Floats, image: Floats) -> dict[str, float]:
-    """Return SSIM, RMSE in grey levels and L1 of one column against its reference."""
-    grey = GREY_LEVELS / reference.max()
-    return {
-        "ssim": ssim(grey * reference, grey * image),
-        "rmse_grey": float(grey * np.sqrt(np.mean((image - reference) ** 2))),
-        "l1": float(np.abs(image - reference).sum()),
-    }
-
-
 def sample_voxels(grid: Grid, count: int, rng: np.random.Generator) -> Floats:
     """Return the centres (count, 3) of random voxels of a grid, world axes."""
     indices = np.stack([rng.integers(0, n, count) for n in grid.shape_xyz], axis=1)
@@ -226,9 +216,16 @@ def weights_figures(columns: list[Column], long_count: Integers) -> dict[str, An
     voxels = []
     for column, rays in zip(columns, long_count, strict=True):
         entry: dict[str, Any] = {"centre_mm": list(column.centre_mm)}
-        for name, (reference, image) in COMPARISONS.items():
-            if reference in column.images and image in column.images:
-                entry[name] = compare_columns(column.images[reference], column.images[image])
+        for name, pair in COMPARISONS.items():
+            if not column.images.keys() >= set(pair):
+                continue
+            reference, image = (column.images[each] for each in pair)
+            grey = GREY_LEVELS / reference.max()
+            entry[name] = {
+                "ssim": ssim(grey * reference, grey * image),
+                "rmse_grey": float(grey * np.sqrt(np.mean((image - reference) ** 2))),
+                "l1": float(np.abs(image - reference).sum()),
+            }
         converged = column.images["ert"]
         entry["pixels"] = int(np.count_nonzero(converged))
         entry["independent_rays_l1"] = quadrature.sampling_error(converged, int(rays) or PAPERS_COUNT.rays)
