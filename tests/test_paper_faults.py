@@ -26,17 +26,19 @@ from lfpiv_cli.optics.tracing import ObjectSpace
 from lfpiv_cli.paper import camera as of_camera
 from lfpiv_cli.paper import faults, influences, small_rig
 from lfpiv_cli.paper.bubbles import _rows, bubbles
-from lfpiv_cli.paper.camera import discussion, elongations_mm, geometric_depth_mm, smallest_errors_mm
+from lfpiv_cli.paper.camera import discussion, elongations_mm, geometric_depth_mm
 from lfpiv_cli.paper.faults import FAULTS, LIMIT_SIGMAS, NONE, WORDS, Limit, allowed, fault_rows, missed_limits, said_to
 from lfpiv_cli.paper.influences import DISTANCE, F_NUMBERS, FOCUS, INDEX, LEVER, NOISE, SHIFT, WALL, Influence
 from lfpiv_cli.paper.parts import Work, read_json, sections
 from lfpiv_cli.paper.sensitivities import INFLUENCES, Measured, care, crowding, drawing_of, rows_of, table_of
 from lfpiv_cli.paper.small_rig import CHANNEL, Case, Rig, displacement
 from lfpiv_cli.paper.table4 import TINY, channel_sections
+from lfpiv_cli.particles.view import raw_view
 from lfpiv_cli.reconstruction.images import still_light
 from lfpiv_cli.reconstruction.solvers import SolverSettings
 from lfpiv_cli.synthetic.render import Readout
 from lfpiv_cli.synthetic.scenes import Box, Bubbles, bubbles_at_wall, channel_walls, render_bubbles
+from lfpiv_cli.validation.planning import errors_alone_mm
 from lfpiv_cli.validation.volume import TERMS, fit_errors, pairs_of
 from tests.commands import SAMPLE, WATER, run, sample_weights
 from tests.vector_fields import field_on
@@ -196,7 +198,7 @@ def by_theory(influence: Influence, factor: float = 1.0) -> Measured:
 )
 def test_the_map_names_each_displacement(name: str, error: Callable[[Floats], Floats]):
     true = places()
-    figures = fit_errors(true, error(true)).figures
+    figures, _ = fit_errors(true, error(true))
     assert figures.pop(name) == pytest.approx(0.3, abs=1e-12)
     assert np.allclose(list(figures.values()), 0.0, atol=1e-12)
 
@@ -205,15 +207,13 @@ def test_the_map_tells_its_standard_errors_and_leaves_outliers_out_and_needs_pla
     rng, true = np.random.default_rng(1), places(4000)
     error = rng.normal(0.0, [0.01, 0.01, 0.2], true.shape)
     error[:40, 2] += 50.0
-    fitted = fit_errors(true, error)
-    figures, sigma = fitted.figures, fitted.sigma
-    assert fitted.count <= len(true) - 40
+    figures, sigma = fit_errors(true, error)
     assert all(abs(figures[name]) < 5.0 * sigma[name] for name in figures if not name.startswith("spread"))
     assert figures["spread_z"] == pytest.approx(0.2, abs=5.0 * sigma["spread_z"])
     # the mean of n values of this spread
     assert sigma["offset_z"] == pytest.approx(0.2 / np.sqrt(len(true)), rel=0.1)
     true = places(TERMS)
-    assert np.isnan(list(fit_errors(true, true).figures.values())).all()
+    assert np.isnan(list(fit_errors(true, true)[0].values())).all()
 
 
 def test_influences_are_fitted_pictured_and_strewn_as_they_are_named():
@@ -473,17 +473,16 @@ def test_geometric_depth_moves_the_outermost_views_by_a_microlens(small_camera) 
 
 
 def test_depth_is_known_least_at_the_focal_plane_and_less_beside_neighbours(small_camera) -> None:
-    sigma = smallest_errors_mm(small_camera, WATER, [-3.0, 0.0, 3.0], Readout())
+    view, tracers = raw_view(small_camera, WATER, 0.025), np.array([[0.023, -0.017, z, 5e5] for z in (-3.0, 0.0, 3.0)])
+    sigma = errors_alone_mm(view, tracers, Readout())
     assert sigma[1, 2] > 10.0 * sigma[[0, 2], 2].max()
     # read noise alone: twice as much is twice the error
-    quiet, loud = (
-        smallest_errors_mm(small_camera, WATER, [2.0], Readout(None, noise, 96.0))[0, 2] for noise in (50.0, 100.0)
-    )
+    quiet, loud = (errors_alone_mm(view, tracers[2:], Readout(None, noise, 96.0))[0, 2] for noise in (50.0, 100.0))
     assert loud == pytest.approx(2.0 * quiet, rel=0.01)
     # Neighbours cost accuracy.
     crowd = replace(small_camera, columns=160, rows=160)
     error_mm = of_camera.smallest_errors_crowded_mm
-    few, many = (error_mm(crowd, WATER, each, 4.0, Readout(), np.random.default_rng(3)) for each in (0.05, 1.0))
+    few, many = (error_mm(crowd, WATER, each, 4.0, np.random.default_rng(3)) for each in (0.05, 1.0))
     assert many[2] > 1.2 * few[2]
 
 

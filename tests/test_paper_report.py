@@ -297,10 +297,16 @@ def test_boards_of_the_full_size_and_where_the_steps_err(tmp_path):
     assert all((scene.photons_per_count, scene.read_noise_counts))
     depth = np.arange(-4.0, 5.0)
     errors = np.where(np.abs(depth[:-1] + 0.5) < 2.0, -0.07, 0.01)
-    reported = table3._where_steps(depth, errors)
+    by_depth = {"depth_mm": depth, "centre_mm": np.append(-4.0, np.cumsum(1.0 + errors) - 4.0)}
+    figures = {method: {"depth_error": np.abs(errors).mean(), "by_depth": by_depth} for method in table3.METHODS}
+    reported = table3._row(boards, "depth_error", figures).reason
     # four steps of 7 %, four of 1 %
     assert reported.startswith("88 % of it comes from the 4 steps within 2 mm")
-    assert reported.endswith("1.00 %")
+    assert reported.endswith("; the others err by 1.00 %")
+    by_depth = {"depth_mm": depth[3:6], "centre_mm": [-0.9, 0.0, 0.9]}
+    figures["ert"] = {"depth_error": 0.1, "by_depth": by_depth}
+    reported = table3._row(boards, "depth_error", figures).reason
+    assert reported == "100 % of it comes from the 2 steps within 2 mm of the focal plane"
     by_depth = {"depth_mm": [-2.0, 0.0, 2.0], "spacing_mm": [1.0, 1.01, 1.0], "centre_mm": [-2.2, 0.0, 1.9]}
     figure = location_figure({"ERT": {"by_depth": by_depth}}, 1.0, None)
     curves = {axes.get_title(): axes.get_lines()[-1].get_ydata() for axes in figure.axes}

@@ -1,5 +1,6 @@
 """Simulated scenes: what the truth says is what the images show; `simulate` as a command, through pipes, by waves."""
 
+import copy
 import json
 import re
 from dataclasses import replace
@@ -132,19 +133,24 @@ def test_tracers_of_a_long_sequence_stay_on_their_paths(frames, rng):
 
 def test_sizes_flicker_and_brightness_have_their_spread(rng):
     tracers = Tracers(4000, Box((0, 0, 0), (1, 1, 1)), diameter_log_sigma=0.3, brightness_flicker=0.2)
-    logarithm, flicker = np.log(tracers.draw_sizes(rng)), tracers.draw_flicker(3, rng)
+    _, _, sizes, flicker = tracers.drawn(3, rng)
+    logarithm = np.log(sizes)
     # standard errors of 4000 and 12000: 0.005 and 0.0034, 0.002 and 0.0014
     assert (logarithm.mean(), logarithm.std()) == (pytest.approx(0.0, abs=0.02), pytest.approx(0.3, abs=0.014))
     assert (flicker.mean(), flicker.std()) == (pytest.approx(1.0, abs=0.008), pytest.approx(0.2, abs=0.008))
     # each frame has its own
     assert abs(np.corrcoef(flicker)[0, 1]) < 0.06
-    brightness = Tracers(4000, Box((0.0, 0.0, 0.0), (1.0, 1.0, 1.0)), brightness_log_sigma=0.5).draw_brightness(rng)
+    _, brightness, _, _ = Tracers(4000, Box((0, 0, 0), (1, 1, 1)), brightness_log_sigma=0.5).drawn(2, rng)
     assert np.mean(np.log(brightness)) == pytest.approx(0.0, abs=0.03)  # 0.5/sqrt(4000) is 0.008
     assert np.std(np.log(brightness)) == pytest.approx(0.5, abs=0.02)
-    before, tracers = rng.bit_generator.state, Tracers(3, Box((0, 0, 0), (1, 1, 1)))
-    assert np.array_equal(tracers.draw_sizes(rng), np.ones(3))
-    assert np.array_equal(tracers.draw_flicker(2, rng), np.ones((2, 3)))
-    assert rng.bit_generator.state == before
+    # those that do not differ take nothing from the random numbers but their places and brightness
+    again, tracers = copy.deepcopy(rng), Tracers(3, Box((0, 0, 0), (1, 1, 1)))
+    places, brightness, sizes, flicker = tracers.drawn(2, rng)
+    assert np.array_equal(sizes, np.ones(3))
+    assert np.array_equal(flicker, np.ones((2, 3)))
+    assert np.array_equal(places, again.uniform(0.0, 1.0, (3, 3)))
+    assert np.array_equal(brightness, again.uniform(0.6, 1.4, 3))
+    assert rng.bit_generator.state == again.bit_generator.state
 
 
 def test_tracers_fill_the_box_and_come_into_the_light_and_leave_it(small):
@@ -171,7 +177,7 @@ def test_tracers_fill_a_pipe_and_go_round_in_circles(rng):
     for axis, half_mm in (("x", 1.0), ((1.0, 0.05, 0.0), 4.0)):
         pipe = RoundWall(2.0, (0.0, 0.5, -0.4), axis)
         box = Box((-half_mm, -9.0, -9.0), (half_mm, 9.0, 9.0)).within(scenes.pipe_bounds(pipe))
-        places = Tracers(4000, box, walls=pipe).draw_places(rng)
+        places, _, _, _ = Tracers(4000, box, walls=pipe).drawn(2, rng)
         assert places.shape == (4000, 3)
         share = (pipe.distances_mm(places) / 2.0) ** 2
         assert share.max() <= 1.0

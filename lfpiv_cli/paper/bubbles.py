@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from lfpiv_cli.arrays import Flags, Singles
+from lfpiv_cli.arrays import Flags
 from lfpiv_cli.console import Console
 from lfpiv_cli.files.config import load_rig
 from lfpiv_cli.files.images import read_image, write_tiff
@@ -134,14 +134,9 @@ def _simulated(clean: Path, with_bubbles: Path, work: Work) -> dict[str, Any]:
     calibrate_snapshot(clean, calibration, pictures, **common)
     build_weights_file(clean, work.folder / "weights.h5", BuildWeightsOptions(calibration=calibration), **common)
     pitch_px = float(load_rig(clean).camera_model().micro_image_lattice_px().pitch.max())
-    left_out = still_light(_pair(work), pitch_px)
+    left_out = still_light([read_image(work.folder / "bubbles" / name) for name in frame_names(2)], pitch_px)
     write_tiff(work.folder / MASK, np.where(left_out, 0, 255).astype(np.uint8), overwrite=True)
     return {"pixels_left_out": int(left_out.sum())}
-
-
-def _pair(work: Work) -> list[Singles]:
-    """Return the images with bubbles."""
-    return [read_image(work.folder / "bubbles" / name) for name in frame_names(2)]
 
 
 def _measured(name: str, case: Case, work: Work) -> dict[str, Any]:
@@ -214,7 +209,7 @@ def _drawings(work: Work, methods: Mapping[str, Measured], duct: Duct) -> tuple[
     plane = int(np.argmax(np.where(beside_wall(without, duct), np.nan_to_num(error), 0.0).sum(axis=(1, 2))))
     depth = float((without.field.grid.axis_mm(2)[plane] - duct.position_mm(2, 0.0)) / duct.width_mm)
     return (
-        Drawing.of("raw", raw_figure, _pair(work)[0][shown], mask[shown]),
+        Drawing.of("raw", raw_figure, read_image(work.folder / "bubbles" / frame_names(2)[0])[shown], mask[shown]),
         Drawing(
             "vectors",
             f"Vectors and errors in the plane at z/D = {depth:.2f}, in which most is spoilt beside the wall; "

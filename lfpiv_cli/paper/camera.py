@@ -357,14 +357,8 @@ def geometric_depth_mm(camera: Camera, media: Media) -> float:
     return float(scale.lens_mm * camera.focus_distance_mm / (2.0 * camera.aperture_radius_mm) / media.depth_ratio)
 
 
-def smallest_errors_mm(camera: Camera, media: Media, depths_mm: Sequence[float], readout: Readout) -> Floats:
-    """Return the Cramer-Rao bound (n, 3) of x, y and z of a tracer alone, by its depth."""
-    particles = np.array([[*BESIDE_MM, depth, LIGHT_COUNTS] for depth in depths_mm])
-    return errors_alone_mm(raw_view(camera, media, RADIUS_MM), particles, readout)
-
-
 def smallest_errors_crowded_mm(
-    camera: Camera, media: Media, per_lens: float, deepest_mm: float, readout: Readout, rng: np.random.Generator
+    camera: Camera, media: Media, per_lens: float, deepest_mm: float, rng: np.random.Generator
 ) -> Floats:
     """Return the median bound (3,) of x, y and z of a tracer among others that are to be found as well.
 
@@ -381,7 +375,7 @@ def smallest_errors_crowded_mm(
         places = rng.uniform([*(-0.5 * side), -deepest_mm], [*(0.5 * side), deepest_mm], (count, 3))
         particles = np.column_stack([places, np.full(count, LIGHT_COUNTS)])
         slope = slopes(view, particles)
-        bound = cramer_rao_bound(slope, pixel_variance(expected_image(slope, particles), readout))
+        bound = cramer_rao_bound(slope, pixel_variance(expected_image(slope, particles), Readout()))
         # whose light lies on the sensor
         inner = np.all(np.abs(places[:, :2]) < 0.25 * side, axis=1)
         errors.extend(bound.sigma_mm(joint=True)[inner])
@@ -460,10 +454,12 @@ def discussion(work: Work) -> Findings:
 def _by_depth(work: Work, camera: Camera, media: Media) -> dict[str, Any]:
     depths = np.linspace(-DEEPEST_MM, DEEPEST_MM, work.by_size(3, 17, 33)).tolist()
     coarse = np.linspace(-DEEPEST_MM, DEEPEST_MM, work.by_size(1, 5, 9)).tolist()
+    particles = np.array([[*BESIDE_MM, depth, LIGHT_COUNTS] for depth in depths])
+    sigma = errors_alone_mm(raw_view(camera, media, RADIUS_MM), particles, Readout())
     iterations = work.by_size(2, 30, 200)
     return {
         "depth_mm": depths,
-        "sigma_mm": smallest_errors_mm(camera, media, depths, Readout()).tolist(),
+        "sigma_mm": sigma.tolist(),
         "iterations": iterations,
         "elongation_depth_mm": coarse,
         "elongation_mm": elongations_mm(camera, media, coarse, SolverSettings("sart", iterations)).tolist(),
@@ -474,5 +470,5 @@ def _by_seeding(work: Work, camera: Camera, media: Media) -> dict[str, Any]:
     seedings = work.by_size((0.1, 0.7), (0.05, 0.2, 0.67), (0.05, 0.1, 0.2, 0.4, 0.67, 1.0, 1.3))
     crowded = replace(camera, columns=CROWD_SIDE_PX, rows=CROWD_SIDE_PX)
     rng = np.random.default_rng(SEED_OF_DISCUSSION)
-    sigma = [smallest_errors_crowded_mm(crowded, media, each, SLAB_MM, Readout(), rng).tolist() for each in seedings]
+    sigma = [smallest_errors_crowded_mm(crowded, media, each, SLAB_MM, rng).tolist() for each in seedings]
     return {"per_lens": list(seedings), "sigma_mm": sigma}

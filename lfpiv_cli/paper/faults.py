@@ -196,8 +196,7 @@ def place_and_velocity_figures(middle: Points, moved: Points, true_places: Point
     pairs = max(paired, key=lambda each: (len(each.found), -float(np.sum(np.abs(each.error_voxel)))))
     places, moves = middle[pairs.found], moved[pairs.found]
     true, expected = true_places[pairs.true], true_moves[pairs.true]
-    fitted = fit_errors(true, places - true)
-    figures, sigma = fitted.figures, fitted.sigma
+    figures, sigma = fit_errors(true, places - true)
     for axis, name in enumerate(COMPONENTS):
         power = np.sum(expected[:, axis] ** 2)
         slope = np.sum(moves[:, axis] * expected[:, axis]) / power

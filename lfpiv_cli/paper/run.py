@@ -19,7 +19,7 @@ from lfpiv_cli.notice import written
 from lfpiv_cli.paper.bubbles import bubbles
 from lfpiv_cli.paper.camera import discussion, focal_plane, table1, table2
 from lfpiv_cli.paper.faults import faults
-from lfpiv_cli.paper.parts import Findings, Row, Work, kept, read_json, rows_of
+from lfpiv_cli.paper.parts import Findings, Work, kept, read_json, rows_of
 from lfpiv_cli.paper.sensitivities import sensitivities
 from lfpiv_cli.paper.table3 import table3
 from lfpiv_cli.paper.table4 import table4
@@ -87,29 +87,28 @@ def page_of(
         f"The parts took {minutes:.0f} minutes.",
     )
     notes = tuple(f"{row.quantity} ({row.source}): {row.reason}" for row in rows if row.reason)
-    table = pages.Table("All quantities", HEAD, tuple(_cells(row) for row in rows))
+    lines = []
+    for row in rows:
+        values = (row.paper_dlfc, row.paper_ert, row.dlfc, row.ert, row.best)
+        limit = f"{'≤' if row.sense == 'at most' else '≥'} {written(row.limit, 4)}"
+        reported = ("–" if value is None else written(value) for value in values)
+        lines.append((row.quantity, *reported, limit, row.verdict, row.source))
     sections = []
     for name, part in parts.items():
         tables = [pages.Table(t["caption"], tuple(t["head"]), tuple(map(tuple, t["rows"]))) for t in part["tables"]]
         seeds = f"Seeds {', '.join(map(str, part['seeds']))}. " if part["seeds"] else ""
         seconds = part["seconds"]
         took = f"{seconds:.0f} s" if seconds < 100.0 else f"{seconds / 60.0:.0f} min"
-        reported = (*part["text"], f"{seeds}This part took {took}.")
+        paragraphs = (*part["text"], f"{seeds}This part took {took}.")
         pictures = [pages.Picture(folder / each["path"], each["caption"]) for each in part["pictures"]]
         again = f"lfpiv validate paper {'--quick ' if size == 'quick' else ''}-o . --resume --only {name}"
         commands = (*part["commands"], again)
-        sections.append(pages.Section(PARTS[name].title, name, reported, tuple(tables), tuple(pictures), commands))
+        sections.append(pages.Section(PARTS[name].title, name, paragraphs, tuple(tables), tuple(pictures), commands))
     libraries = ", ".join(f"{name} {version}" for name, version in made["libraries"].items())
     foot = f"Made by lfpiv {made['version']} ({libraries})."
     if notes:
         sections.append(pages.Section("Where ours as the paper did it differs, and why", "reasons", notes))
-    return pages.Page(TITLE, text, (table,), tuple(sections), foot)
-
-
-def _cells(row: Row) -> tuple[str, ...]:
-    values = ("–" if v is None else written(v) for v in (row.paper_dlfc, row.paper_ert, row.dlfc, row.ert, row.best))
-    sense = "≤" if row.sense == "at most" else "≥"
-    return (row.quantity, *values, f"{sense} {written(row.limit, 4)}", row.verdict, row.source)
+    return pages.Page(TITLE, text, (pages.Table("All quantities", HEAD, tuple(lines)),), tuple(sections), foot)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -107,19 +107,14 @@ def sensitivities(work: Work) -> Findings:
             care(found),
             *(crowding(each) for each in found if each.influence is SEEDING),
         ),
-        seeds=tuple(range(1, 1 + max(realisations(work, each) for each in chosen))),
+        seeds=tuple(range(1, 1 + max(work.by_size(1, 1, each.repeats) for each in chosen))),
     )
-
-
-def realisations(work: Work, influence: Influence) -> int:
-    """Return how often each point is measured."""
-    return influence.repeats if work.size == "full" else 1
 
 
 def measured(work: Work, influence: Influence) -> Measured:
     """Measure an influence at all its values."""
     values = work.by_size(*influence.values)
-    seeds = range(1, 1 + realisations(work, influence))
+    seeds = range(1, 1 + work.by_size(1, 1, influence.repeats))
     points = [
         [work.step(f"{influence.name}_{value:.3g}_{seed}", partial(influence.measure, value, seed)) for seed in seeds]
         for value in values

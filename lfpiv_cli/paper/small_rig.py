@@ -224,7 +224,7 @@ def place_figures(case: Case, tracers: Tracers, rng: np.random.Generator, readou
 def judged(found: Points, tracers: Tracers) -> Figures:
     """Return the figures of measured places (n, 3) of tracers that stand apart."""
     pairs = pairs_of(found, tracers.position_mm, GATE_MM)
-    figures = fit_errors(tracers.position_mm[pairs.true], pairs.error_voxel).figures
+    figures, _ = fit_errors(tracers.position_mm[pairs.true], pairs.error_voxel)
     return figures | found_shares(pairs, found, tracers)
 
 

@@ -7,7 +7,7 @@ Three methods: SART on voxels as wide as a microlens with equivalent points (ERT
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, Literal
@@ -105,12 +105,16 @@ QUANTITIES = {
 
 @dataclass(frozen=True, eq=False)
 class _Boards:
-    """The boards of one half of Table 3; pictures, benches and solvers are made when a board first needs them."""
+    """The boards of one half of Table 3; pictures, benches and solvers are made when a board first needs them.
+
+    `ways` are those by the methods that boards have needed so far.
+    """
 
     half: Half
     depths_mm: tuple[float, ...]
     paper: Config
     best: Config
+    ways: dict[str, tuple[BoardBench, BoardSolver]] = field(default_factory=dict)
 
     @property
     def board(self) -> BoardGeometry:
@@ -126,11 +130,6 @@ class _Boards:
     def pictures(self) -> list[Any]:
         """One for each depth, in their order, as random numbers are drawn for one after the other."""
         return [self.bench.picture(placement_of(self.paper, depth)) for depth in self.depths_mm]
-
-    @cached_property
-    def ways(self) -> dict[str, tuple[BoardBench, BoardSolver]]:
-        """By the method, those that a board has needed so far."""
-        return {}
 
     def measure(self, method: str, number: int, advance: Callable[[int], None]) -> dict[str, Any]:
         """Reconstruct one board and return what is measured of it, as plain data, and of the middle one a view."""
@@ -224,7 +223,12 @@ def _row(boards: _Boards, measure: str, figures: Figures) -> Row:
         table = figures["ert"]["by_depth"]
         depth = np.array(table["depth_mm"])
         if measure == "depth_error":
-            reason = _where_steps(depth, np.diff(table["centre_mm"]) / np.diff(depth) - 1.0)
+            errors = np.abs(np.diff(table["centre_mm"]) / np.diff(depth) - 1.0)
+            near = np.abs(0.5 * (depth[1:] + depth[:-1])) < NEAR_MM
+            share, steps = errors[near].sum() / errors.sum(), f"{near.sum()} steps within {NEAR_MM:g} mm"
+            reason = f"{100.0 * share:.0f} % of it comes from the {steps} of the focal plane"
+            if not near.all():
+                reason += f"; the others err by {100.0 * errors[~near].mean():.2f} %"
         else:
             off = 100.0 * np.abs(np.array(table["spacing_mm"]) / spacing_mm - 1.0)
             values, unit = (off, "%") if measure == "lateral_error" else (np.array(table[measure]), "mm")
@@ -268,16 +272,6 @@ def _drawings(
             location_figure(named, boards.board.spacing_mm, steps),
         ),
     )
-
-
-def _where_steps(depth_mm: Floats, errors: Floats) -> str:
-    """Return in words which steps the depth error comes from."""
-    near = np.abs(0.5 * (depth_mm[1:] + depth_mm[:-1])) < NEAR_MM
-    share = np.abs(errors[near]).sum() / np.abs(errors).sum()
-    reported = f"{100.0 * share:.0f} % of it comes from the {near.sum()} steps within {NEAR_MM:g} mm of the focal plane"
-    if near.all():
-        return reported
-    return f"{reported}; the others err by {100.0 * np.abs(errors[~near]).mean():.2f} %"
 
 
 def _text(work: Work, boards: _Boards, figures: Figures) -> tuple[str, ...]:

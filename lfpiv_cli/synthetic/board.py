@@ -18,7 +18,7 @@ from lfpiv_cli.calibration.board_pose import BoardGeometry
 from lfpiv_cli.calibration.shape_fit import nearest_points
 from lfpiv_cli.calibration.views import charuco_board
 from lfpiv_cli.errors import ConfigError
-from lfpiv_cli.optics.camera import Camera, Lattice, Objective, undistorted
+from lfpiv_cli.optics.camera import Camera, Objective, undistorted
 from lfpiv_cli.optics.curved_space import CurvedSpace
 from lfpiv_cli.optics.media import Media, equivalent_object_distance, exact_lateral_mm
 from lfpiv_cli.optics.tracing import ObjectSpace
@@ -101,16 +101,15 @@ def render_plate(camera: Camera, space: ObjectSpace, plate: Plate, level: float,
     line = (np.arange(samples) + 0.5) / samples - 0.5
     # about the middle of a pixel, where rays would end but for the blur
     places = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2) - blur_px[np.arange(samples**2) % len(blur_px)]
-    centred = Lattice(np.zeros(2), camera.lattice.basis, camera.lattice.layout)
-    size = np.array(plate.picture.shape[::-1])
+    basis, size = camera.lattice.basis, np.array(plate.picture.shape[::-1])
     image = np.empty((camera.rows, camera.columns))
     for top in range(0, camera.rows, ROWS_AT_ONCE):
         row, column = np.mgrid[top : min(top + ROWS_AT_ONCE, camera.rows), : camera.columns]
         px = np.stack([column, row], axis=-1).astype(np.float64)
         first, total = (px @ PIXEL_STEPS).reshape(-1, 2), np.zeros(px.shape[:2])
         for k, place in enumerate(places):
-            cell = ((first + k * SEQUENCE[:2]) % 1.0) @ centred.basis
-            offset = cell - nearest_points(cell, centred.origin, centred.basis)
+            cell = ((first + k * SEQUENCE[:2]) % 1.0) @ basis
+            offset = cell - nearest_points(cell, np.zeros(2), basis)
             crossing, slope = _rays_to((px + place).reshape(-1, 2), offset, camera)
             passes = np.flatnonzero(np.hypot(crossing[:, 0], crossing[:, 1]) <= camera.aperture_radius_mm)
             on_plate = _on_plate(crossing[passes], slope[passes], camera, space, plate)

@@ -334,10 +334,11 @@ def source(
     take up the fluid.
     """
 
-    def spread(r: Floats) -> Floats:
-        return rate_per_s / 3.0 * np.exp(-np.sum(r**2, axis=1, keepdims=True) / (2.0 * radius_mm**2))
+    def flow(r: Floats) -> Floats:
+        rate = rate_per_s / 3.0 * np.exp(-np.sum(r**2, axis=1, keepdims=True) / (2.0 * radius_mm**2))
+        return np.asarray(rate * r / MM_PER_M)
 
-    return _placed(lambda r: spread(r) * r / MM_PER_M, centre_mm, velocity_m_s)
+    return _placed(flow, centre_mm, velocity_m_s)
 
 
 _FACTORIES = (square_duct, pipe, rigid_rotation, taylor_green, shear, uniform, random_modes, abc, vortex_ring, source)

@@ -125,33 +125,30 @@ class Tracers:
     light_z_mm: tuple[float, float] | None = None
     walls: Walls | None = None
 
-    def draw_places(self, rng: np.random.Generator) -> Floats:
-        """Return where the tracers are at the sequence's middle (count, 3)."""
+    def drawn(self, frames: int, rng: np.random.Generator) -> tuple[Floats, Floats, Floats, Floats]:
+        """Return what chance decides of the tracers; numbers are drawn only for what differs between them.
+
+        Returns
+        -------
+        places : (count, 3), where they are at the sequence's middle
+        brightness : (count,)
+        sizes : (count,), their diameters over the median
+        flicker : (frames, count), the light of each in each frame over its own, of mean 1
+        """
         places = rng.uniform(self.box.low_mm, self.box.high_mm, (self.count, 3))
-        beyond = np.zeros(self.count, dtype=np.bool_) if self.walls is None else ~self.walls.contain(places)
-        while self.walls is not None and beyond.any():
+        while self.walls is not None and (beyond := ~self.walls.contain(places)).any():
             places[beyond] = rng.uniform(self.box.low_mm, self.box.high_mm, (int(beyond.sum()), 3))
-            beyond = ~self.walls.contain(places)
-        return places
-
-    def draw_brightness(self, rng: np.random.Generator) -> Floats:
-        """Return the brightness (count,) of each tracer."""
         if self.brightness_log_sigma is None:
-            return rng.uniform(*self.brightness, self.count)
-        return rng.lognormal(0.0, self.brightness_log_sigma, self.count)
-
-    def draw_sizes(self, rng: np.random.Generator) -> Floats:
-        """Return the diameter (count,) of each tracer over their median; without a spread no numbers are drawn."""
-        if self.diameter_log_sigma == 0.0:
-            return np.ones(self.count)
-        return rng.lognormal(0.0, self.diameter_log_sigma, self.count)
-
-    def draw_flicker(self, frames: int, rng: np.random.Generator) -> Floats:
-        """Return each tracer's light in each frame (frames, count) over its own, of mean 1, as `draw_sizes` does."""
-        if self.brightness_flicker == 0.0:
-            return np.ones((frames, self.count))
-        variance = np.log1p(self.brightness_flicker**2)
-        return rng.lognormal(-0.5 * variance, np.sqrt(variance), (frames, self.count))
+            brightness = rng.uniform(*self.brightness, self.count)
+        else:
+            brightness = rng.lognormal(0.0, self.brightness_log_sigma, self.count)
+        sizes, flicker = np.ones(self.count), np.ones((frames, self.count))
+        if self.diameter_log_sigma != 0.0:
+            sizes = rng.lognormal(0.0, self.diameter_log_sigma, self.count)
+        if self.brightness_flicker != 0.0:
+            variance = np.log1p(self.brightness_flicker**2)
+            flicker = rng.lognormal(-0.5 * variance, np.sqrt(variance), (frames, self.count))
+        return places, brightness, sizes, flicker
 
     def lit(self, points_mm: Floats) -> Flags:
         """Return which of the points (..., 3) lie in the light."""
@@ -311,12 +308,11 @@ def simulate_particles(
     still : expected counts (rows, columns) of light that does not move, in all frames
     progress : called with the number of tracers rendered, for each frame those that are lit
     """
-    positions = tracers.draw_places(rng)
-    brightness, sizes = tracers.draw_brightness(rng), tracers.draw_sizes(rng)
+    positions, brightness, sizes, flicker = tracers.drawn(motion.frames, rng)
     brightness, diameters = brightness * sizes**2, tracers.diameter_mm * sizes
     places = motion.places_mm(positions)
     lit = tracers.lit(places)
-    shown = brightness * tracers.draw_flicker(motion.frames, rng) * lit
+    shown = brightness * flicker * lit
     images = []
     for place, seen, light in zip(places, lit, tracers.light_counts * shown, strict=True):
         balls = Balls(place[seen], light[seen], diameters[seen])

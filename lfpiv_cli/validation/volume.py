@@ -23,6 +23,7 @@ from lfpiv_cli.validation.board import elongation_mm
 
 # A particle counts as found within so many voxels laterally and in depth.
 LATERAL_VOXEL, DEPTH_VOXEL = 0.5, 2.0
+DEPTH_TO_LATERAL = DEPTH_VOXEL / LATERAL_VOXEL
 # Of normal errors 95 % lie within so many standard deviations.
 COVERED_SIGMAS = 1.96
 
@@ -116,30 +117,24 @@ OUTLIER_SIGMAS, OUTLIER_ROUNDS = 5.0, 3
 TERMS, FEWEST = 6, 10
 
 
-@dataclass(frozen=True)
-class PlaceErrors:
-    """The fitted map: its figures by name, their standard errors, and how many tracers were fitted.
-
-    Lengths are in mm, stretches and angles are ratios (twist: per mm of depth).
-    """
-
-    figures: dict[str, float]
-    sigma: dict[str, float]
-    count: int
-
-
 def pairs_of(measured_mm: Floats, true_mm: Floats, gate_mm: float) -> Matches:
     """Pair measured with true tracers that stand apart: nearest first, laterally within a gate, nearly any depth.
 
     Errors are returned in mm.
     """
-    scale = np.array([1.0, 1.0, DEPTH_VOXEL / LATERAL_VOXEL / DEPTH_TO_LATERAL_GATE])
+    scale = np.array([1.0, 1.0, DEPTH_TO_LATERAL / DEPTH_TO_LATERAL_GATE])
     found = match(measured_mm * scale, true_mm * scale, gate_mm / LATERAL_VOXEL)
     return Matches(found.found, found.true, measured_mm[found.found] - true_mm[found.true])
 
 
-def fit_errors(true_mm: Floats, error_mm: Floats) -> PlaceErrors:
-    """Fit the map to errors (n, 3) at true places (n, 3); NaN where there are hardly more of them than terms."""
+def fit_errors(true_mm: Floats, error_mm: Floats) -> tuple[dict[str, float], dict[str, float]]:
+    """Fit the map to errors (n, 3) at true places (n, 3); NaN where there are hardly more of them than terms.
+
+    Returns
+    -------
+    figures, sigma : by name, and their standard errors; lengths in mm, stretches and angles as ratios (twist: per mm of
+        depth)
+    """
     # b, B_x, B_y, B_z, C_x, C_y of each component, their standard errors, and the standard deviation of what is left
     coefficients = sigma = np.full((TERMS, 3), np.nan)
     spread, count = sigma[0], 0
@@ -168,11 +163,9 @@ def fit_errors(true_mm: Floats, error_mm: Floats) -> PlaceErrors:
         return {name: float(value) for name, value in found.items()}
 
     errors = named(sigma, np.hypot, spread / np.sqrt(2.0 * max(count, 1)))
-    return PlaceErrors(named(coefficients, np.subtract, spread), errors, count)
+    return named(coefficients, np.subtract, spread), errors
 
 
-# Depth reaches so many times farther than a microlens.
-DEPTH_TO_LATERAL = DEPTH_VOXEL / LATERAL_VOXEL
 # Beyond this many standard deviations a Gaussian particle is below 1e-4 of its peak.
 REACH = 4.3
 # Peaks with less light than this share of a typical particle's are noise to any later step.
