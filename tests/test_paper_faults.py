@@ -25,12 +25,13 @@ from lfpiv_cli.optics.surfaces import Surface
 from lfpiv_cli.optics.tracing import ObjectSpace
 from lfpiv_cli.paper import camera as of_camera
 from lfpiv_cli.paper import faults, influences, small_rig
+from lfpiv_cli.paper import sensitivities as of_sensitivities
 from lfpiv_cli.paper.bubbles import _rows, bubbles
 from lfpiv_cli.paper.camera import discussion, elongations_mm, geometric_depth_mm
 from lfpiv_cli.paper.faults import FAULTS, LIMIT_SIGMAS, NONE, WORDS, Limit, allowed, fault_rows, missed_limits, said_to
 from lfpiv_cli.paper.influences import DISTANCE, F_NUMBERS, FOCUS, INDEX, LEVER, NOISE, SHIFT, WALL, Influence
-from lfpiv_cli.paper.parts import Work, read_json, sections
-from lfpiv_cli.paper.sensitivities import INFLUENCES, Measured, care, crowding, drawing_of, rows_of, table_of
+from lfpiv_cli.paper.parts import Findings, Work, read_json, sections
+from lfpiv_cli.paper.sensitivities import INFLUENCES, Measured, crowding, drawing_of, rows_of
 from lfpiv_cli.paper.small_rig import CHANNEL, Case, Rig, displacement
 from lfpiv_cli.paper.table4 import TINY, channel_sections
 from lfpiv_cli.particles.view import raw_view
@@ -288,16 +289,22 @@ def test_scatter_is_held_against_its_bound(spread: float, verdict: str):
     assert [row.verdict for row in rows_of(found)] == [verdict]
 
 
-def test_what_harms_most_comes_first():
-    found = [by_theory(INDEX), by_theory(WALL), by_theory(FOCUS), by_theory(SHIFT)]
-    text = care(found)
+def test_what_harms_most_comes_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(of_sensitivities, "measured", lambda _, influence: by_theory(influence))
+
+    def findings(*influences: Influence) -> Findings:
+        monkeypatch.setattr(of_sensitivities, "INFLUENCES", influences)
+        return of_sensitivities.sensitivities(Work(tmp_path, "quick", Console(quiet=True), {}))
+
+    found = findings(INDEX, WALL, FOCUS, SHIFT)
+    text = found.text[2]
     # 0.3 mm of wall, 0.1 mm of focus, 0.005 of index: 0.27, 0.13 and 0.019 mm; lens images harm least
     assert text.index("0.27 mm") < text.index("0.13 mm") < text.index("0.019 mm")
     assert "white image" not in text
-    assert [row[0] for row in table_of(found).rows][:2] == ["wall", "focus"]
+    assert [row[0] for row in found.tables[0].rows][:2] == ["wall", "focus"]
+    assert "calliper" in text
     # a wall that is known to the micrometre: what harms is something else
-    known = replace(WALL, typical=(0.001, ""))
-    assert "calliper" not in care([by_theory(known), *found[:1], *found[2:]])
+    assert "calliper" not in findings(replace(WALL, typical=(0.001, "")), INDEX, FOCUS, SHIFT).text[2]
 
 
 @pytest.mark.parametrize(("recall", "reported"), [((0.97, 0.95, 0.6), "from 1.2 on"), ((1.0, 1.0, 1.0), "at none")])

@@ -27,7 +27,7 @@ from lfpiv_cli.paper.parts import TABLE_2, Drawing, Findings, Row, Work, read_js
 from lfpiv_cli.paper.pictures import board_view, location_figure
 from lfpiv_cli.paper.run import PARTS, PaperOptions, Part, validate_paper
 from lfpiv_cli.synthetic import board as rendering
-from lfpiv_cli.validation.board import MEASURES
+from lfpiv_cli.validation.board import DEPTHS_MM, MEASURES
 from lfpiv_cli.validation.flow import PAPER_OVERALL, PAPER_SLICES, Duct, Measured
 from lfpiv_cli.validation.methods import slice_at
 from lfpiv_cli.verbs.simulate import board_depths
@@ -286,15 +286,16 @@ def test_a_part_goes_on_from_the_boards_that_are_kept(found, work_folder, monkey
 
 def test_boards_of_the_full_size_and_where_the_steps_err(tmp_path):
     work = Work(tmp_path, "full", QUIET, {})
-    boards = table3._boards(work, "ideal")
-    assert len(boards.depths_mm) == 17
+    assert sum(abs(depth) <= table3.REACH_MM["full"] for depth in DEPTHS_MM) == 17
+    configs = {half: load_rig(table3._config(work, half, "paper")) for half in ("ideal", "recorded")}
     for axis in range(3):
-        tenths = boards.paper.grid().axis_mm(axis) / 0.1
+        tenths = configs["ideal"].grid().axis_mm(axis) / 0.1
         np.testing.assert_allclose(tenths, np.round(tenths), atol=1e-9)
-    scene = table3._boards(Work(tmp_path, "full", QUIET, {}), "recorded").paper.simulation
+    scene = configs["recorded"].simulation
     assert scene.refraction == "exact"
     assert all((scene.rotation_deg, scene.distortion_per_mm2, *scene.shift_px))
     assert all((scene.photons_per_count, scene.read_noise_counts))
+    boards = table3._Boards("ideal", DEPTHS_MM, configs["ideal"], configs["ideal"])
     depth = np.arange(-4.0, 5.0)
     errors = np.where(np.abs(depth[:-1] + 0.5) < 2.0, -0.07, 0.01)
     by_depth = {"depth_mm": depth, "centre_mm": np.append(-4.0, np.cumsum(1.0 + errors) - 4.0)}

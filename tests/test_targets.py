@@ -263,8 +263,7 @@ def test_a_white_plate_is_a_white_image_by_the_tracer_s_rays(camera: Camera, rng
     # Back through window and water to a tilted plate, and from there forward again.
     camera, media, window = replace(small(camera), distortion_per_mm2=2e-5), Media(1.0, 1.49, 1.33), Window(98.0, 2.0)
     placement = BoardPlacement(1.5, (0.1, -0.2), (12.0, -7.0), 20.0)
-    steps = placement.to_world([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
-    plate = printed_plate(camera, CHESS, steps)
+    plate = printed_plate(camera, CHESS, placement)
     crossing, slope = _rays_to(rng.uniform(0, 440, (50, 2)), np.array([0.02, -0.03]), camera)
     on_plate = _on_plate(crossing, slope, camera, ObjectSpace(media, window), plate)
     points = placement.to_world(on_plate)

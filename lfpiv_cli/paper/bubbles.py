@@ -15,9 +15,9 @@ from lfpiv_cli.console import Console
 from lfpiv_cli.files.config import load_rig
 from lfpiv_cli.files.images import read_image, write_tiff
 from lfpiv_cli.files.pages import Table
-from lfpiv_cli.paper.parts import Drawing, Findings, Row, Work
+from lfpiv_cli.paper.parts import AS_PAPER, Drawing, Findings, Row, Work
 from lfpiv_cli.paper.pictures import PAPERS_WALL, plane_figure, raw_figure, wall_profile_figure
-from lfpiv_cli.paper.table4 import SEED, TINY, ChannelSize, as_paper, at_best, channel_sections, simulated_duct
+from lfpiv_cli.paper.table4 import SEED, TINY, ChannelSize, at_best, channel_sections, simulated_duct
 from lfpiv_cli.reconstruction.images import still_light
 from lfpiv_cli.validation.flow import TOLERANCE, Duct, Measured, relative_errors
 from lfpiv_cli.verbs.build_weights import BuildWeightsOptions, build_weights_file
@@ -97,7 +97,7 @@ def bubbles(work: Work) -> Findings:
     cases = {
         "clean": Case("no bubbles", "clean", {}),
         "hidden": Case("no bubbles, same pixels hidden", "clean", {"mask": work.folder / MASK}),
-        "paper": Case("bubbles, SART", "bubbles", as_paper(size)),
+        "paper": Case("bubbles, SART", "bubbles", AS_PAPER | {"iterations": size.iterations}),
         "bubbles": Case("bubbles", "bubbles", {}),
         "background": Case("bubbles, background off", "bubbles", {"background": "minimum"}),
         "mask": Case("bubbles, mask", "bubbles", {"mask": "still"}),

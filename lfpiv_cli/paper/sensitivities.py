@@ -88,6 +88,8 @@ def sensitivities(work: Work) -> Findings:
     """Vary each influence, draw the errors that follow and tell how much matters."""
     chosen = [each for each in INFLUENCES if work.size != "tiny" or each.name in TINY]
     found = [measured(work, each) for each in chosen]
+    harmful = sorted(found, key=lambda each: -each.largest_error_mm())[:SENTENCES]
+    advice = [each.influence.advice.format(error=f"{written(each.largest_error_mm(), 2)} mm") for each in harmful]
     return Findings(
         rows=tuple(row for each in found for row in rows_of(each)),
         drawings=tuple(drawing_of(each) for each in found),
@@ -104,7 +106,7 @@ def sensitivities(work: Work) -> Findings:
             "where the mid plane is believed to be. A focal plane is wrong where the lens is focused elsewhere than "
             "believed, and the believed plane was brought to the middle of the channel. A depth that is wrong by an "
             "index is right at the inner face of the wall and grows from there.",
-            care(found),
+            f"What to take care of, the most harmful first. {' '.join(advice)}",
             *(crowding(each) for each in found if each.influence is SEEDING),
         ),
         seeds=tuple(range(1, 1 + max(work.by_size(1, 1, each.repeats) for each in chosen))),
@@ -209,13 +211,6 @@ def table_of(found: Sequence[Measured]) -> Table:
     ]
     caption = "Sensitivities, by the error of places that typically follows"
     return Table(caption, tuple(rows[0]), tuple(tuple(row.values()) for row in rows))
-
-
-def care(found: Sequence[Measured]) -> str:
-    """Return what to take care of: a sentence for each of the influences that harm most."""
-    ordered = sorted(found, key=lambda each: -each.largest_error_mm())[:SENTENCES]
-    sentences = [each.influence.advice.format(error=f"{written(each.largest_error_mm(), 2)} mm") for each in ordered]
-    return "What to take care of, the most harmful first. " + " ".join(sentences)
 
 
 def crowding(found: Measured) -> str:

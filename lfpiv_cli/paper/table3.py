@@ -147,12 +147,6 @@ class _Boards:
         return {"dots": vars(dots), "view": view, "residual": residual}
 
 
-def _boards(work: Work, half: Half) -> _Boards:
-    reach = REACH_MM[work.size]
-    depths = tuple(depth for depth in of_boards.DEPTHS_MM if abs(depth) <= reach)
-    return _Boards(half, depths, load_rig(_config(work, half, "paper")), load_rig(_config(work, half, "best")))
-
-
 def _config(work: Work, half: Half, name: str) -> Path:
     """Write a config of `CHANGES` for a half of the table and return its path."""
     small = SMALL[work.size]
@@ -166,10 +160,9 @@ def _config(work: Work, half: Half, name: str) -> Path:
 
 def table3(work: Work, half: Half) -> Findings:
     """Reconstruct and measure boards: of an ideal camera (Section 3.3), or of one with faults and noise (4.1)."""
-    boards = _boards(work, half)
-    configs = tuple(CHANGES) if half == "ideal" else ("paper", "best")
-    for name in configs:
-        _config(work, half, name)
+    configs = {name: _config(work, half, name) for name in (CHANGES if half == "ideal" else ("paper", "best"))}
+    depths = tuple(depth for depth in of_boards.DEPTHS_MM if abs(depth) <= REACH_MM[work.size])
+    boards = _Boards(half, depths, load_rig(configs["paper"]), load_rig(configs["best"]))
     steps: dict[str, list[dict[str, Any]]] = {}
     for method in ("ert", "best", "dlfc"):
         # each board a step of its own

@@ -84,11 +84,6 @@ TINY = ChannelSize(1.6, 1.6, 400, 400, (8,), 5, (3, 3), 0.5, 5_000)
 EM_ITERATIONS = 24
 
 
-def as_paper(size: ChannelSize) -> dict[str, Any]:
-    """Return how the paper reconstructs; SART's volumes are correlated plainly."""
-    return AS_PAPER | {"iterations": size.iterations}
-
-
 def at_best(size: ChannelSize) -> dict[str, Any]:
     """Return how this program does."""
     iterations = min(EM_ITERATIONS, size.iterations)
@@ -195,7 +190,9 @@ def table4(work: Work) -> Findings:
 
 def _ways(size: ChannelSize) -> dict[str, dict[str, Any]]:
     """Return the sections of the config of each of `WAYS`."""
-    sart, best = {"reconstruction": as_paper(size)}, {"reconstruction": at_best(size)}
+    # SART's volumes are correlated plainly
+    sart = {"reconstruction": AS_PAPER | {"iterations": size.iterations}}
+    best = {"reconstruction": at_best(size)}
     volumes: dict[str, Any] = {"validation": {"flow_methods": ["volumes"]}}
     # weights that are fitted to boards at several depths in the fluid
     fitted = {"board": {"dots": list(size.dots), "medium": "fluid"}, "weights": {"method": "dlfc"}}

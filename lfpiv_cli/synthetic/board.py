@@ -62,14 +62,10 @@ class Plate:
     samples_per_mm: float
 
 
-def printed_plate(camera: Camera, board: BoardGeometry, plate_mm: Floats) -> Plate:
-    """Return the plate of a target: what is printed, rows along y and columns along x, `SQUARE_SAMPLES` to a square.
-
-    Parameters
-    ----------
-    plate_mm : (3, 3) world axes: the plate's middle, and the points a millimetre from it along x and along y
-    """
-    middle, x, y = camera.to_image_axes(plate_mm)
+def printed_plate(camera: Camera, board: BoardGeometry, placement: BoardPlacement) -> Plate:
+    """Return the plate of a target: what is printed, rows along y and columns along x, `SQUARE_SAMPLES` to a square."""
+    # the plate's middle, and the points a millimetre from it along x and along y
+    middle, x, y = camera.to_image_axes(placement.to_world([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]))
     # a print is read from the front, whatever the sensor's axes are called
     along_x = x - middle if camera.column_axis == "x" else middle - x
     across, down = (n + 1 for n in board.dots)
@@ -246,9 +242,8 @@ def render_board(
             )
         if isinstance(space, CurvedSpace):
             raise ConfigError(f"board.pattern: is {board.pattern}; behind the faces of a scene only dots are simulated")
-        steps = placement.to_world([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
         blur = diffused_mm(camera) if waves is None else lens_blur_mm(camera, waves)
-        return render_plate(camera, space, printed_plate(camera, board, steps), level, blur / camera.pixel_mm)
+        return render_plate(camera, space, printed_plate(camera, board, placement), level, blur / camera.pixel_mm)
     plate = _plate_centres(board)
     if shown is not None:
         plate = plate[np.asarray(shown, dtype=bool)]
