@@ -85,11 +85,9 @@ def _placed(
         own = flow(points_mm - centre)
         return own if velocity_m_s is None else np.asarray(own + uniform_m_s)
 
-    def pressures(points_mm: Floats, density_kg_m3: float) -> Floats:
-        assert pressure is not None
-        return pressure(points_mm - centre, density_kg_m3)
-
-    return KnownFlow(velocity, None if pressure is None else pressures)
+    if pressure is None:
+        return KnownFlow(velocity)
+    return KnownFlow(velocity, lambda points_mm, density_kg_m3: pressure(points_mm - centre, density_kg_m3))
 
 
 def dynamic_pressure(velocity_m_s: Floats, density_kg_m3: float) -> Floats:
