@@ -324,6 +324,10 @@ def test_the_method_with_the_lower_error_is_named(truth: Floats, inside: Flags) 
     assert better["whole_vector"] == better["rms_v_voxel"] == "b"
     # All within a quarter but the outlier, which the one misses and the other has wrong; nothing flows along z.
     assert not {"within_25_percent_vector", "slope_w", "slice_mean_error"} & set(better)
+    # A slope is to be 1, and what one method does not know is not compared.
+    figures = {"a": {"slope_u": 0.95, "rms_u_voxel": None}, "b": {"slope_u": 0.9, "rms_u_voxel": 0.1}}
+    figures["c"] = {"slope_u": 0.8, "rms_u_voxel": 0.2}
+    assert lower_error(methods, figures) == {"whole_vector": "b", "slope_u": "a"}
 
 
 SHEAR = "{kind: shear, along: x, across: z, rate_per_s: 30.0, velocity_m_s: [0.12, 0.0, 0.0]}"

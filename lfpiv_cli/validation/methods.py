@@ -40,10 +40,10 @@ def radius_figure(fields: Mapping[str, VectorField], pipe: RoundWall, mean_veloc
     return figure
 
 
-# Figures that are compared, by how their error follows from them.
-ERROR_OF = {
-    "size": ("streamwise_mean_error", "slice_mean_error", "rms_u_voxel", "rms_v_voxel", "rms_w_voxel"),
-    "distance from one": (
+# Figures that are compared, by what they are without an error.
+WITHOUT_ERROR = {
+    0.0: ("streamwise_mean_error", "slice_mean_error", "rms_u_voxel", "rms_v_voxel", "rms_w_voxel"),
+    1.0: (
         "within_25_percent_streamwise",
         "within_25_percent_vector",
         "within_25_percent_vector_inner",
@@ -64,22 +64,19 @@ def lower_error(methods: Mapping[str, Measured], figures: Mapping[str, Mapping[s
     if common.any():
         for method, m in methods.items():
             rms[method] = float(np.sqrt(np.mean(np.sum((m.field.velocity - m.truth)[common] ** 2, axis=-1))))
-    better = {"whole_vector": _lowest(rms)}
-    for kind, names in ERROR_OF.items():
+    errors = {"whole_vector": rms}
+    for expected, names in WITHOUT_ERROR.items():
         for name in names:
             values = {method: found.get(name) for method, found in figures.items()}
-            if kind != "size":
-                values = {method: None if value is None else 1.0 - value for method, value in values.items()}
-            better[name] = _lowest({method: None if value is None else abs(value) for method, value in values.items()})
-    return {name: method for name, method in better.items() if method is not None}
-
-
-def _lowest(errors: Mapping[str, float | None]) -> str | None:
-    """Return whose error is the lowest, None where one is unknown or none is lower than the others."""
-    known = {name: error for name, error in errors.items() if error is not None}
-    if len(known) < len(errors) or len(set(known.values())) < 2:
-        return None
-    return min(known, key=lambda name: known[name])
+            errors[name] = {
+                method: None if value is None else abs(expected - value) for method, value in values.items()
+            }
+    better = {}
+    for name, by_method in errors.items():
+        known = {method: error for method, error in by_method.items() if error is not None}
+        if len(known) == len(by_method) and len(set(known.values())) > 1:
+            better[name] = min(known, key=known.__getitem__)
+    return better
 
 
 # Pictures of a measured flow beside the true one, all components of it in three planes.
@@ -181,7 +178,7 @@ def slices_figure(methods: Mapping[str, Measured], duct: Duct) -> style.Figure:
     for row, (name, axis) in zip(axes, duct.across.items(), strict=True):
         # of what a slice leaves of [z, y, x], the one that the flow follows
         along, other = [k for k in (2, 1, 0) if k != axis].index(main), 3 - axis - main
-        for panel, share in zip(row, PAPER_SLICES[name], strict=True):
+        for panel, (share, (_, paper_ert)) in zip(row, PAPER_SLICES[name].items(), strict=True):
             position = duct.position_mm(axis, share)
             panel.axhline(0.0, color=style.GREY, linewidth=0.8)
             if first.flow is not None:
@@ -194,12 +191,10 @@ def slices_figure(methods: Mapping[str, Measured], duct: Duct) -> style.Figure:
                 of_slice = slice_at(values[..., main], first.field.grid.axis_mm(axis), position, axis)
                 look = {"color": colour, "markerfacecolor": "none", "label": label}
                 panel.plot(first.field.grid.axis_mm(other), mean_of_known(of_slice, (along,)), marker, **look)
-            rows = {method: table[f"{name} {share}"] for method, table in tables.items()}
-            ours = {method: errors["ours_percent"] for method, errors in rows.items()}
-            errors = [f"{name} unknown" if e is None else f"{name} {e:.2f} %" for name, e in ours.items()]
+            ours = {method: table[f"{name} {share}"]["ours_percent"] for method, table in tables.items()}
+            errors = [f"{method} unknown" if e is None else f"{method} {e:.2f} %" for method, e in ours.items()]
             reported = textwrap.fill(f"mean error: {', '.join(errors)}", TITLE_WIDTH)
-            paper = next(iter(rows.values()))["paper_ert_percent"]
-            beside = f" (paper {paper:.2f} %)" if duct.is_the_papers else ""
+            beside = f" (paper {paper_ert:.2f} %)" if duct.is_the_papers else ""
             panel.set_title(f"{name} = {share}{beside}\n{reported}")
             panel.set(xlabel=f"{style.AXIS_NAMES[other]} (mm)", ylabel=f"{style.COMPONENT_NAMES[main]} (m/s)")
     axes[0, 0].legend()
