@@ -20,7 +20,6 @@ from lfpiv_cli.pictures.vectors import mean_of_known
 from lfpiv_cli.validation.flow import PAPER_SLICES, TOLERANCE, Duct, Measured, cumulative_distribution
 from lfpiv_cli.validation.methods import slice_at
 
-# Colours that people with any kind of colour vision tell apart; marks and lines differ as well, for print in grey.
 BOARD_STYLES: tuple[dict[str, Any], ...] = (
     {"color": style.VERMILION, "marker": "s", "linestyle": "--"},
     {"color": style.BLUE, "marker": "o", "linestyle": "-"},
@@ -178,7 +177,6 @@ def _tidy(space: Any) -> None:
     space.locator_params(nbins=5)
 
 
-# Colours that the colour-blind tell apart; in print markers do.
 WAY_STYLES = ((style.VERMILION, "s", "--"), (style.BLUE, "o", "-."), (style.GREEN, "^", "-"), (style.PURPLE, "v", ":"))
 
 

@@ -26,8 +26,7 @@ from lfpiv_cli.optics.tracing import struck_pixel, trace_ray
 
 # Additive recurrence in four dimensions (aperture and ball): powers of the inverse of the root of x^5 = x + 1, whose
 # multiples fill the unit cube more evenly than random points do.
-SEQUENCE_ROOT = 1.1673039782614187
-SEQUENCE = SEQUENCE_ROOT ** -np.arange(1.0, 5.0)
+SEQUENCE = 1.1673039782614187 ** -np.arange(1.0, 5.0)
 
 # Another one, by the root of x^7 = x + 1, for what moves a ray's end: it goes with none of the numbers above.
 BLUR_SEQUENCE = 1.1127756842787 ** -np.arange(1.0, 7.0)

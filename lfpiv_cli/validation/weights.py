@@ -151,10 +151,8 @@ def make_columns(
         exact direct tracing; 0: none
     progress : called with 1 after each voxel
     """
-    fine, coarse = (
-        (quadrature.REFERENCE_TILES, quadrature.REFERENCE_DEPTH_NODES),
-        (quadrature.REFERENCE_TILES // 2, quadrature.REFERENCE_DEPTH_NODES),
-    )
+    fine = quadrature.REFERENCE_TILES, quadrature.REFERENCE_DEPTH_NODES
+    coarse = quadrature.REFERENCE_TILES // 2, quadrature.REFERENCE_DEPTH_NODES
     in_use: dict[str, ObjectSpace] = {}
     if isinstance(space, CurvedSpace):
         ways: dict[str, tuple[Space, tuple[int, int]]] = {
