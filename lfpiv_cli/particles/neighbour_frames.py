@@ -30,7 +30,6 @@ from lfpiv_cli.particles.rounds import (
     accepted,
     after_rounds,
     candidates_of,
-    concluded,
     finished,
     with_candidates,
     with_suspects_checked,
@@ -247,10 +246,7 @@ def second_pass(task: Task, own: Floats, neighbours: Sequence[Floats]) -> State:
         sweep(task, state, unexplained, sweeps, SEARCH_GAIN)
     # Three may be where two are, one of them found here for both: with the third beside them chi-squared needs all.
     state, _ = prune(task, merge(task, state), CLAIMED_SHARE, LAST_UNEXPLAINED)
-    fits = judged(task, state, ROUNDS[-1].unexplained)
-    state, _ = with_suspects_checked(task, state, fits, ROUNDS[-1])
-    # First passes have told two with one peak apart.
-    return concluded(task, merge(task, state), ROUNDS[-1])
+    return finished(task, state, ROUNDS[-1])
 
 
 def _missing_particles(task: Task, own: Floats, neighbours: Sequence[Floats]) -> tuple[Floats, NDArray[np.bool_]]:
