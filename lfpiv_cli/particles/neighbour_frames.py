@@ -65,8 +65,9 @@ from lfpiv_cli.tracks.tracking import expected_of, known_of, reach_of, track
 # A particle goes on as predicted where it ends within so many standard errors of its place and of its light.
 PREDICTED_SIGMAS = 4.0
 # Standard errors of what is predicted, at least: laterally in microlenses, in depth in depths over which light spreads
-# by one lens (Table 2: 0.005 and 0.05 mm), and of the logarithm of the light.
-SURE_LENSES, SURE_DEPTHS, SURE_LIGHT = 0.05, 0.05 / 1.064, 0.02
+# by one lens (Table 2: 0.005 and 0.05 mm), and of the logarithm of the light, as fits share out the light of neighbours
+# differently from frame to frame: most of 1.9 tracers for each microlens by a hundredth or two, one in ten by a fifth.
+SURE_LENSES, SURE_DEPTHS, SURE_LIGHT = 0.05, 0.05 / 1.064, 0.05
 # How little unexplained light counts in sweeps in which each light is held within these limits, and in the one after.
 HELD, FREE = (0.3, 0.1, 0.1), 0.05
 # The search of what particles leave that go on.
@@ -166,8 +167,6 @@ TRUSTED_SHARE = 0.98
 EXPECTED_LENSES, EXPECTED_DEPTHS = 0.2, 0.1 / 1.064
 # Share of the first frame's particles that must be expected so.
 LEAST_EXPECTED = 0.6
-# Standard error of the logarithm of light from frame to frame: fits share out the light of neighbours differently.
-LIGHT_SIGMA = 0.05
 # Units of progress that prediction saves.
 SAVED_STEPS = sum(settings.iterations + 1 for settings in ROUNDS[1:]) - STEPS
 
@@ -215,7 +214,7 @@ def predicted_by(trusted: Floats, seen: Floats, scale: Scale) -> Predicted:
     if len(tracks.first):
         at[:, 3] *= np.median(seen[tracks.second, 3] / trusted[tracks.first, 3])
     enough = np.all(sigma < scale.box_mm(EXPECTED_LENSES, EXPECTED_DEPTHS), axis=1)
-    return Predicted(at, sigma, LIGHT_SIGMA).part(enough)
+    return Predicted(at, sigma, SURE_LIGHT).part(enough)
 
 
 # A particle without a partner this near to where one is expected is that one, at another depth: near the focal plane
