@@ -9,7 +9,7 @@ from scipy.interpolate import BSpline
 from lfpiv_cli.arrays import Floats, Integers
 from lfpiv_cli.fields import stencils
 from lfpiv_cli.fields.fit import Field, fit_field
-from lfpiv_cli.fields.spline_field import SplineField, first_expectation, lattice_for, most_probable
+from lfpiv_cli.fields.spline_field import SplineField, first_expectation, most_probable
 from lfpiv_cli.fields.stencils import DIVERGENCE, SECOND, SECOND_IN_DEPTH, SMOOTHNESS, Expectation, Lattice, bound
 from lfpiv_cli.fields.structure import Samples, belonging, with_places, without_itself
 
@@ -333,7 +333,7 @@ def test_walls_hold_the_field_still() -> None:
 
 @pytest.mark.thorough
 def test_errors_that_are_stated_too_small_are_noticed() -> None:
-    samples, lattice = tracks(shear, 120, 16), lattice_for(120, LOW, HIGH)
+    samples, lattice = tracks(shear, 120, 16), Lattice.over(LOW, HIGH, 1.0)
     stated = replace(samples, covariance_mm2=samples.covariance_mm2 / 4.0)
     first = first_expectation(stated, lattice, (*SMOOTHNESS, DIVERGENCE))
     found, _ = most_probable(stated, lattice, first, np.random.default_rng(16))

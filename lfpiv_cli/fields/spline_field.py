@@ -243,14 +243,9 @@ def _inverse(matrix: Floats) -> tuple[Floats, tuple[Floats, bool]]:
     return inverse_of(factor[0]), factor
 
 
-# Knots are so many times the samples' mean distance apart: a third as many knots as samples. Among factors of 1.2 to
-# 1.8, less adds noise where samples are few, and more holds divergence and values of small vortices further off.
-KNOTS_OF_DISTANCE = 1.4
 # Rounds of weighing samples; the last change of their probabilities that matters, on the average.
 ROUNDS, LAST_CHANGE = 4, 0.002
 POINTS_AT_ONCE = 500
-# So many samples for each unknown tell such a field.
-ENOUGH_OF_UNKNOWNS = 1
 # Penalties have taken something where what is put back varies by more than this share of the fit's variance: it is
 # at most 0.13 where stated errors cover the truth, and 0.2 to 0.8 where they cover 0.66 to 0.9 of it. Twice what is put
 # back is the error that may be left: they cover 0.88 to 1 then.
@@ -343,12 +338,6 @@ class SplineField:
         return found
 
 
-def lattice_for(samples: int, low_mm: Floats, high_mm: Floats) -> stencils.Lattice:
-    """Return the knots for so many samples in a box."""
-    distance = float(np.prod(np.subtract(high_mm, low_mm)) / max(samples, 1)) ** (1.0 / 3.0)
-    return stencils.Lattice.affordable(low_mm, high_mm, KNOTS_OF_DISTANCE * distance)
-
-
 def spline_field(
     samples: Samples, lattice: stencils.Lattice, divergence: str, rng: np.random.Generator, still_mm: Floats
 ) -> SplineField:
@@ -366,9 +355,9 @@ def spline_field(
     about = replace(samples, value_mm=samples.value_mm - mean)
     penalties = stencils.SMOOTHNESS if divergence == "off" else (*stencils.SMOOTHNESS, stencils.DIVERGENCE)
     expected = first_expectation(about, lattice, penalties)
-    # The gradients of a field of wide knots tell what errors of places add.
+    # The gradients of a field of wide knots tell what errors of places add; a sample for each unknown tells such one.
     wide = lattice.wide()
-    few = np.sort(rng.choice(len(about), min(len(about), ENOUGH_OF_UNKNOWNS * wide.unknowns), replace=False))
+    few = np.sort(rng.choice(len(about), min(len(about), wide.unknowns), replace=False))
     part = about.subset(few)
     covariance = error_covariance(part, 1.0, expected.unresolved_mm)
     _, coefficients = _solved(part, wide, _before(wide, expected, still_mm), covariance, part.probability)
