@@ -19,7 +19,7 @@ from scipy.special import gammaincinv
 
 from lfpiv_cli.arrays import Floats, Integers
 from lfpiv_cli.robust import MAD_TO_SIGMA
-from lfpiv_cli.tracks.candidates import NO_TRACK, Seen, Trajectories
+from lfpiv_cli.tracks.candidates import Seen, Trajectories, tracks_in
 
 # Material acceleration: the second derivative of trajectories at one time, with its covariance.
 #
@@ -79,9 +79,7 @@ def motions_at(
     found: Trajectories, frames: Sequence[Seen], frame: int, derivatives: HighDerivatives
 ) -> tuple[Integers, Motion]:
     """Return the tracks that have a place in a frame and two more in the window about it, and their motion there."""
-    numbers = found.labels[frame]
-    numbers = np.unique(numbers[numbers != NO_TRACK])
-    window = _window(frame, len(frames))
+    numbers, window = tracks_in(found, [frame]), _window(frame, len(frames))
     position, covariance = places_with_covariances(found, frames, window, numbers)
     enough = np.isfinite(position[..., 0]).sum(axis=1) >= FREE_OF_QUARTIC
     time = np.array(window, dtype=np.float64) - frame
@@ -101,8 +99,7 @@ def high_derivatives_in(found: Trajectories, frames: Sequence[Seen]) -> HighDeri
     share = MOST_TRACKS // len(windows)
     reported: list[tuple[Floats, Floats, Floats]] = []
     for window in windows:
-        numbers = found.labels[window[0]]
-        numbers = np.unique(numbers[numbers != NO_TRACK])
+        numbers = tracks_in(found, window[:1])
         for frame in window[1:]:
             numbers = np.intersect1d(numbers, found.labels[frame])
         position, covariance = places_with_covariances(

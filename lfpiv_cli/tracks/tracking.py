@@ -42,7 +42,7 @@ ALONE = 0.1
 LEAST_LIGHT_RATIO = 0.02
 
 
-def votes(points: Floats, candidates: Candidates, density_per_mm3: float, scale: Scale, equal: Floats) -> Floats:
+def votes(points: Floats, candidates: Candidates, density_per_mm3: float, scale: Scale) -> Floats:
     """Return the logarithm (c,) of how much more likely each pair is than chance; -inf where light excludes it.
 
     Parameters
@@ -50,9 +50,8 @@ def votes(points: Floats, candidates: Candidates, density_per_mm3: float, scale:
     points : (n, 3) of the first frame
     candidates : in the order of these
     density_per_mm3 : of the particles of the second frame
-    equal : (3,) what distances are divided by, so that they are known equally well along all axes
     """
-    taken = np.flatnonzero(candidates.light_ratio > LEAST_LIGHT_RATIO)
+    taken, equal = np.flatnonzero(candidates.light_ratio > LEAST_LIGHT_RATIO), of_equal_errors(scale)
     ratio = candidates.light_ratio[taken]
     begin = np.searchsorted(candidates.first[taken], np.arange(len(points) + 1))
     count = min(NEIGHBOURS + 1, len(points))
@@ -262,21 +261,19 @@ def track(
         return links
     shown = np.nan_to_num(common_displacements(first.position_mm, second.position_mm, scale))
     far = _linked_about(shown, first, second, SURE_REACH * reach, scale)
-    return far if _of_one_motion(far, first, second) else _nearest(links, first, second, reach)
+    if _of_one_motion(far, first, second):
+        return far
+    # Those that are so short, beside the reach, that chance makes few.
+    off = (second.position_mm[links.second] - first.position_mm[links.first]) / reach
+    by_chance = np.linalg.norm(off, axis=1) ** 3 * _candidates_each(first, second, reach)
+    kept = by_chance < MOST_BY_CHANCE
+    return Tracks(links.first[kept], links.second[kept], (links.probability * np.exp(-by_chance))[kept])
 
 
 def _of_one_motion(links: Tracks, first: Seen, second: Seen) -> bool:
     """Return whether links agree better than chance makes them."""
     count, most = len(links.first), min(len(first), len(second))
     return links.log_odds > min(SURE_ODDS, SURE_ODDS_EACH * count if 2 * count > most else SURE_ODDS)
-
-
-def _nearest(links: Tracks, first: Seen, second: Seen, reach: Floats) -> Tracks:
-    """Return those links that are so short, beside a reach (3,), that chance makes few."""
-    off = (second.position_mm[links.second] - first.position_mm[links.first]) / reach
-    by_chance = np.linalg.norm(off, axis=1) ** 3 * _candidates_each(first, second, reach)
-    kept = by_chance < MOST_BY_CHANCE
-    return Tracks(links.first[kept], links.second[kept], (links.probability * np.exp(-by_chance))[kept])
 
 
 def reach_of(scale: Scale, search_mm: float | None = None) -> Floats:
@@ -361,7 +358,7 @@ def _linked_about(
     middle, reached = _sought(middle_mm, first, second, reach, scale, forecast)
     candidates = candidates_of(first, second, middle, reached, reach)
     density = density_per_mm3(first, second, reach)
-    score = votes(first.position_mm, candidates, density, scale, of_equal_errors(scale))
+    score = votes(first.position_mm, candidates, density, scale)
     # Those near the middle, where nobody votes.
     off = candidates.displacement_mm - middle[candidates.first]
     score = score + -0.5 * np.sum((off / reach) ** 2, axis=1)
