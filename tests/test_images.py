@@ -18,7 +18,7 @@ from lfpiv_cli.optics.media import Media
 from lfpiv_cli.particles.noise import Noise
 from lfpiv_cli.particles.view import raw_view
 from lfpiv_cli.reconstruction import images
-from lfpiv_cli.reconstruction.haze import Haze, White
+from lfpiv_cli.reconstruction.haze import Haze, White, white_of
 from lfpiv_cli.reconstruction.images import as_if_lit, defects, filled, light, noise_residual, saturated, touched
 from lfpiv_cli.synthetic.render import Readout, render_white
 from tests.commands import AT_FOCUS, SAMPLE, run, sample_rig, summary_of
@@ -98,12 +98,12 @@ READOUT = Readout(PHOTONS_PER_COUNT, read_noise_counts=8.5, dark_level_counts=0.
 BACKGROUND = (0.0, 8.5)
 
 
-def white_of(camera: Camera, rng: np.random.Generator) -> tuple[np.ndarray, White]:
+def white_light(camera: Camera, rng: np.random.Generator) -> tuple[np.ndarray, White]:
     """Return uniform light as it is, and what a noisy white image tells of it."""
     true = render_white(camera, 1.0, samples_per_side=4)
     photographed = READOUT.record(28_000.0 * true, rng).astype(np.float32) / 28_000.0
     rectification = Rectification(sheet_fit(camera), true.shape)
-    white = White.of(Calibration(rectification, photographed, white=photographed))
+    white = white_of(Calibration(rectification, photographed, white=photographed))
     assert white is not None
     return true, white
 
@@ -133,7 +133,7 @@ def seen(image: np.ndarray, white: White, rng: np.random.Generator) -> Haze | No
 @pytest.mark.parametrize("level", [100.0, 1500.0])
 def test_uneven_or_faint_haze_is_found(camera: Camera, water: Media, rng: np.random.Generator, level: float):
     camera = replace(camera, columns=400, rows=320)
-    true, white = white_of(camera, rng)
+    true, white = white_light(camera, rng)
     for per_lens in (0.05, 0.4, 0.8):
         haze = uneven(true.shape, level, rng)
         found = seen(tracers(camera, water, per_lens, rng) + haze * true, white, rng)
@@ -157,7 +157,7 @@ def test_haze_of_few_counts_is_found_where_a_count_is_of_many_photons(
 ):
     """1.8 counts of noise of 2.4, and 1.4 of half a count, of which rounding leaves steps; 0.3 is an error."""
     camera = replace(camera, columns=400, rows=320)
-    true, white = white_of(camera, rng)
+    true, white = white_light(camera, rng)
     noise, dark = count * BACKGROUND[1], np.ceil(100.0 * count)
     light = count * tracers(camera, water, 0.4, rng) + haze * true
     recorded = Readout(PHOTONS_PER_COUNT / count, noise, 0.0).record(light + dark, rng) - dark
@@ -178,7 +178,7 @@ def test_haze_of_few_counts_is_found_where_a_count_is_of_many_photons(
 def test_tracers_are_no_haze(camera: Camera, water: Media, rng: np.random.Generator, photons_per_count: float):
     """Of four for each microlens a third of the light is in the darkest pixels of all."""
     camera = replace(camera, columns=400, rows=320)
-    _, white = white_of(camera, rng)
+    _, white = white_light(camera, rng)
     readout = replace(READOUT, photons_per_count=photons_per_count)
     for per_lens in (0.05, 0.6, 1.3, 1.6, 2.0, 4.0, 6.0):
         image = readout.record(tracers(camera, water, per_lens, rng) + 100.0, rng).astype(np.float32) - 100.0
@@ -188,7 +188,7 @@ def test_tracers_are_no_haze(camera: Camera, water: Media, rng: np.random.Genera
 def test_another_dark_level_is_no_haze(table2: Camera, water: Media, rng: np.random.Generator):
     """It does not follow the lens images."""
     camera = replace(table2, columns=400, rows=320)
-    true, white = white_of(camera, rng)
+    true, white = white_light(camera, rng)
     image = READOUT.record(tracers(camera, water, 0.2, rng) + 100.0, rng).astype(np.float32)
     assert white.haze_in(image, np.ones(true.shape, np.bool_), (100.0, BACKGROUND[1]), 0.0)[0] is None
 

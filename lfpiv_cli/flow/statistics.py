@@ -17,6 +17,7 @@ Axes: values (u, v, w) in m/s, or any unit of a velocity; symmetric tensors as x
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -166,7 +167,7 @@ def statistics_of(ensemble: Ensemble, fewest: int = 1, profile: Profile | None =
 
     at_once = max(SUMS_BYTES // (8 * max(frames, REPLICATES) * columns.shape[1]), 1)
     parts = blocks(ensemble.places, at_once)
-    tau = decorrelation(np.sum([_powers(sums(part)) for part in parts], axis=0), frames)
+    tau = decorrelation((sums(part) for part in parts), frames)
     block = block_length(float(tau.max()), frames)
     widened = widening(tau, block)
     weights, groups = _weights(frames, block)
@@ -270,18 +271,17 @@ def _error_of_means(found: Floats, drawn: Floats, block: int) -> Floats:
     return np.asarray(np.sqrt(np.where(drawn < 1.0, variance / (1.0 - np.minimum(drawn, 1.0)), np.nan)))
 
 
-def _powers(found: Floats) -> Floats:
-    """Return the powers (2, frames + 1, 3) of the fluctuations' spectra in time and of those of their counts."""
-    each = np.stack([found[..., 1:4], np.broadcast_to(found[..., :1], found[..., 1:4].shape)])
-    return np.asarray((np.abs(np.fft.rfft(each, 2 * found.shape[0], axis=1)) ** 2).sum(axis=2))
-
-
-def decorrelation(powers: Floats, frames: int) -> Floats:
-    """Return how many pairs are worth one, tau (3,), of the powers (2, frames + 1, 3) that `_powers` gives.
+def decorrelation(parts: Iterable[Floats], frames: int) -> Floats:
+    """Return how many pairs are worth one, tau (3,), by the sums (frames, places, 16) of all parts of the places.
 
     Fluctuations are about the mean of these very pairs, by which each rho is about tau / frames too small.
     """
-    products, counts = np.fft.irfft(powers, 2 * frames, axis=1)[:, :frames]
+    powers = []
+    for found in parts:
+        # The spectra in time of the fluctuations, and of how many there are.
+        each = np.stack([found[..., 1:4], np.broadcast_to(found[..., :1], found[..., 1:4].shape)])
+        powers.append((np.abs(np.fft.rfft(each, 2 * frames, axis=1)) ** 2).sum(axis=2))
+    products, counts = np.fft.irfft(np.sum(powers, axis=0), 2 * frames, axis=1)[:, :frames]
     known = counts > 0.5
     correlation = np.divide(products, counts, out=np.zeros_like(products), where=known)
     rho = np.divide(correlation, correlation[0], out=np.zeros_like(correlation), where=correlation[0] > 0.0)[1:]

@@ -133,21 +133,6 @@ class White:
     places: Singles
     plateau: Flags
 
-    @classmethod
-    def of(cls, calibration: Calibration) -> White | None:
-        """Return the white image of a calibration; None where it has none."""
-        light, lattice_px = calibration.white, calibration.fit.lattice_px
-        if light is None:
-            return None
-        lenses = Lenses.of(lattice_px, (light.shape[0], light.shape[1]))
-        row, column = np.indices(light.shape)
-        places = lattice_px.coordinates(np.stack([column, row], axis=-1)).reshape(-1, 2) - lenses.first
-        brightest = np.zeros(math.prod(lenses.shape))
-        np.maximum.at(brightest, lenses.number, light.ravel())
-        usual = ndimage.median_filter(brightest.reshape(lenses.shape), ALIKE_LENSES).ravel()
-        plateau = (light.ravel() > PLATEAU * usual[lenses.number]) & (light.ravel() > 0.0)
-        return cls(light, lenses, np.ascontiguousarray(places.T[::-1], np.float32), plateau)
-
     def haze_in(
         self, picture: Singles, usable: Flags, background: tuple[float, float], level_error: float
     ) -> tuple[Haze | None, float]:
@@ -225,8 +210,18 @@ class White:
 
 @lru_cache(maxsize=1)
 def white_of(calibration: Calibration) -> White | None:
-    """Return `White.of` a calibration, which all its frames share."""
-    return White.of(calibration)
+    """Return the white image of a calibration, which all its frames share; None where it has none."""
+    light, lattice_px = calibration.white, calibration.fit.lattice_px
+    if light is None:
+        return None
+    lenses = Lenses.of(lattice_px, (light.shape[0], light.shape[1]))
+    row, column = np.indices(light.shape)
+    places = lattice_px.coordinates(np.stack([column, row], axis=-1)).reshape(-1, 2) - lenses.first
+    brightest = np.zeros(math.prod(lenses.shape))
+    np.maximum.at(brightest, lenses.number, light.ravel())
+    usual = ndimage.median_filter(brightest.reshape(lenses.shape), ALIKE_LENSES).ravel()
+    plateau = (light.ravel() > PLATEAU * usual[lenses.number]) & (light.ravel() > 0.0)
+    return White(light, lenses, np.ascontiguousarray(places.T[::-1], np.float32), plateau)
 
 
 def _between(of_lenses: Floats, places: NDArray[np.floating]) -> Floats:

@@ -173,50 +173,31 @@ def _brightest(image: Image, sums: Normalisers) -> float:
 # Pixels whose inverse row sum is 0 take no part.
 
 
-def correction(image: Image, projection: Image, inverse_row_sum: Image) -> Image:
-    """Return (I - W E) / sum_n w_in, the correction of Eq. 12."""
-    result = np.empty(image.shape, np.float32)
-    share_out(_correct, image.shape[0], image, projection, inverse_row_sum, result)
-    return result
-
-
 @njit(cache=True, nogil=True)
-def _correct(part: tuple[int, int], image: Image, projection: Image, inverse_row_sum: Image, result: Image) -> None:
-    """Write rows `part` of `correction`."""
+def write_correction(
+    part: tuple[int, int], image: Image, projection: Image, inverse_row_sum: Image, result: Image
+) -> None:
+    """Write rows `part` of (I - W E) / sum_n w_in, the correction of Eq. 12."""
     for row in range(part[0], part[1]):
         for column in range(image.shape[1]):
             difference = image[row, column] - projection[row, column]
             result[row, column] = difference * inverse_row_sum[row, column]
 
 
-def ratio(image: Image, projection: Image, inverse_row_sum: Image) -> Image:
-    """Return I / W E, 0 where the volume does not light a pixel or it takes no part."""
-    result = np.empty(image.shape, np.float32)
-    share_out(_divide, image.shape[0], image, projection, inverse_row_sum, result)
-    return result
-
-
 @njit(cache=True, nogil=True)
-def _divide(part: tuple[int, int], image: Image, projection: Image, inverse_row_sum: Image, result: Image) -> None:
-    """Write rows `part` of `ratio`."""
+def write_ratio(part: tuple[int, int], image: Image, projection: Image, inverse_row_sum: Image, result: Image) -> None:
+    """Write rows `part` of I / W E, 0 where the volume does not light a pixel or it takes no part."""
     for row in range(part[0], part[1]):
         for column in range(image.shape[1]):
             seen = projection[row, column] > 0.0 and inverse_row_sum[row, column] > 0.0
             result[row, column] = image[row, column] / projection[row, column] if seen else np.float32(0.0)
 
 
-def square_differences(image: Image, projection: Image, inverse_row_sum: Image) -> Floats:
-    """Return the sum of (I - W E)^2 of each row (rows,), so that their sum has the same bits for any threads."""
-    result = np.empty(image.shape[0], np.float64)
-    share_out(_sum_squares, image.shape[0], image, projection, inverse_row_sum, result)
-    return result
-
-
 @njit(cache=True, nogil=True)
-def _sum_squares(
+def write_square_differences(
     part: tuple[int, int], image: Image, projection: Image, inverse_row_sum: Image, result: Floats
 ) -> None:
-    """Write rows `part` of `square_differences`."""
+    """Write the sums of (I - W E)^2 of rows `part`, so that their sum has the same bits for any threads."""
     for row in range(part[0], part[1]):
         total = 0.0
         for column in range(image.shape[1]):
@@ -277,7 +258,7 @@ class SolverSettings:
     solver : name in `registry.SOLVERS`
     iterations : at most
     relaxation : of each step
-    accelerate : step from points extrapolated by `Momentum`, at the cost of three passes over the volume
+    accelerate : step from points that are `extrapolated`, at the cost of three passes over the volume
     start : `uniform` (the paper), or `line_of_sight`, which also leaves voxels out for good
     stopping : when to end before all iterations are done
     """
@@ -307,7 +288,8 @@ class Reconstruction:
 
 def sart_step(problem: Problem, volume: Volume, projection: Image, relaxation: float) -> Volume:
     """Return the volume after one step of SART, all pixels at once (Eq. 12), kept non-negative."""
-    change = correction(problem.image, projection, problem.sums.inverse_row_sum)
+    image, change = problem.image, np.empty(problem.image.shape, np.float32)
+    share_out(write_correction, len(image), image, projection, problem.sums.inverse_row_sum, change)
     update = problem.operator.adjoint(change) * problem.sums.inverse_column_sum
     return np.maximum(volume + np.float32(relaxation) * update, np.float32(0.0))
 
@@ -317,7 +299,8 @@ def em_step(problem: Problem, volume: Volume, projection: Image, relaxation: flo
 
     E <- E (W^T (I / W E) / W^T 1)^relaxation. A pixel that the volume does not light explains nothing and is left out.
     """
-    missing = ratio(problem.image, projection, problem.sums.inverse_row_sum)
+    image, missing = problem.image, np.empty(problem.image.shape, np.float32)
+    share_out(write_ratio, len(image), image, projection, problem.sums.inverse_row_sum, missing)
     factor = problem.operator.adjoint(missing) * problem.sums.inverse_column_sum
     if relaxation != 1.0:
         factor **= np.float32(relaxation)
@@ -381,7 +364,7 @@ def reconstruct(
         support = lit_support(operator, problem.image, problem.sums)
         problem = Problem.of(operator, image, problem.sums.within(operator, support))
     volume = point = line_of_sight_start(problem) if settings.start == "line_of_sight" else uniform_start(problem)
-    step, momentum = SOLVERS[settings.solver].step(), Momentum()
+    step, pace = SOLVERS[settings.solver].step(), 1.0
     norm = float(np.sqrt(np.sum(np.square(problem.image, dtype=np.float64))))
     residual: list[float] = []
     for _ in range(settings.iterations):
@@ -392,7 +375,7 @@ def reconstruct(
             break
         previous, volume = volume, step(problem, point, projection, settings.relaxation)
         if settings.accelerate:
-            momentum, point = momentum.extrapolated(point, previous, volume)
+            pace, point = extrapolated(pace, point, previous, volume)
         else:
             point = volume
         if progress:
@@ -402,27 +385,24 @@ def reconstruct(
     return Reconstruction(volume, np.array(residual), taking_part)
 
 
-@dataclass(frozen=True)
-class Momentum:
-    """Nesterov's extrapolation with restart (B. O'Donoghue and E. Candes, Found. Comput. Math. 15, 2015).
+def extrapolated(pace: float, point: Volume, previous: Volume, volume: Volume) -> tuple[float, Volume]:
+    """Return the pace and the point to step from next, when a step from `point` led from `previous` to `volume`.
 
-    `pace` is the t of the recursion t' = (1 + sqrt(1 + 4 t^2))/2; the next point lies (t - 1)/t' of the last change
-    beyond the volume. Where a step points back against the change, the memory is dropped.
+    Nesterov's extrapolation with restart (B. O'Donoghue and E. Candes, Found. Comput. Math. 15, 2015): the pace is the
+    t of the recursion t' = (1 + sqrt(1 + 4 t^2))/2, from 1 on; the next point lies (t - 1)/t' of the last change beyond
+    the volume. Where a step points back against the change, the memory is dropped.
     """
-
-    pace: float = 1.0
-
-    def extrapolated(self, point: Volume, previous: Volume, volume: Volume) -> tuple[Momentum, Volume]:
-        """Return the momentum and the point to step from next, when a step from `point` led to `volume`."""
-        change = volume - previous
-        pace = 1.0 if np.sum((point - volume) * change, dtype=np.float64) > 0.0 else self.pace
-        following = 0.5 * (1.0 + np.sqrt(1.0 + 4.0 * pace**2))
-        change *= np.float32((pace - 1.0) / following)
-        change += volume
-        return Momentum(following), np.maximum(change, np.float32(0.0))
+    change = volume - previous
+    if np.sum((point - volume) * change, dtype=np.float64) > 0.0:
+        pace = 1.0
+    following = 0.5 * (1.0 + np.sqrt(1.0 + 4.0 * pace**2))
+    change *= np.float32((pace - 1.0) / following)
+    change += volume
+    return following, np.maximum(change, np.float32(0.0))
 
 
 def _relative_residual(problem: Problem, projection: Image, norm: float) -> float:
     """Return ||I - W E|| / ||I|| over the pixels that take part, 0 for a dark image."""
-    sums = square_differences(problem.image, projection, problem.sums.inverse_row_sum)
-    return float(np.sqrt(sums.sum())) / norm if norm > 0.0 else 0.0
+    image, squares = problem.image, np.empty(len(problem.image), np.float64)
+    share_out(write_square_differences, len(image), image, projection, problem.sums.inverse_row_sum, squares)
+    return float(np.sqrt(squares.sum())) / norm if norm > 0.0 else 0.0
