@@ -80,7 +80,7 @@ def test_the_divergence_s_integral_is_that_of_the_field() -> None:
     nx, ny, nz = LATTICE.shape
     parts = coefficients.reshape(nx, 3, ny * nz).transpose(1, 0, 2).reshape(3, -1)
     divergence = sum(rows(LATTICE, points, axis) @ parts[axis] for axis in range(3))
-    matrix = stencils.dense(stencils.divergence(LATTICE))
+    matrix = stencils.dense(stencils.penalty(LATTICE, DIVERGENCE))
     expected = float(np.einsum("i,j,k->ijk", *of).ravel() @ np.square(divergence))
     assert coefficients @ matrix @ coefficients == pytest.approx(expected, rel=1e-11)
 
@@ -100,7 +100,7 @@ def test_smoothness_does_not_see_polynomials_of_lower_degree(order: int, free: i
     # Expectations add up.
     weights = {SECOND: 2.0, stencils.THIRD: 3.0, SECOND_IN_DEPTH: 2.0, stencils.THIRD_IN_DEPTH: 3.0, DIVERGENCE: 5.0}
     expected = Expectation(weights, 0.5, 1.0, 0.0)
-    whole = bound(LATTICE, 0.5) + 5.0 * stencils.divergence(LATTICE)
+    whole = bound(LATTICE, 0.5) + 5.0 * stencils.penalty(LATTICE, DIVERGENCE)
     stencils.add_scalar(whole, 1.0, 2.0 * stencils.smoothness(LATTICE, 2) + 3.0 * stencils.smoothness(LATTICE, 3))
     np.testing.assert_allclose(stencils.expected_inverse(LATTICE, expected), whole, rtol=1e-12)
 

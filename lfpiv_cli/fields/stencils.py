@@ -165,17 +165,6 @@ def smoothness(lattice: Lattice, order: int) -> Floats:
     return total
 
 
-def divergence(lattice: Lattice) -> Stencil:
-    """Return the integral of the squared divergence."""
-    matrix = empty(lattice)
-    for one in range(3):
-        for other in range(3):
-            orders = [(int(axis == one), int(axis == other)) for axis in range(3)]
-            along = [lattice.integrals(axis, *orders[axis]) for axis in range(3)]
-            matrix[:, one, :, :, :, other] = _product(*along)
-    return matrix
-
-
 def _product(x: Floats, y: Floats, z: Floats) -> Floats:
     """Return the products (nx, ny, nz, 7, 7, 7) of integrals (n, 7) along three axes."""
     return np.asarray(
@@ -297,10 +286,15 @@ class Expectation:
 
 
 def penalty(lattice: Lattice, name: str, components: int = 3) -> Stencil:
-    """Return the integral of the squares that a penalty is made of, over the box."""
-    if name == DIVERGENCE:
-        return divergence(lattice)
+    """Return the integral over the box of the squared divergence, or of the squared derivatives of an order."""
     matrix = empty(lattice, components)
+    if name == DIVERGENCE:
+        for one in range(3):
+            for other in range(3):
+                orders = [(int(axis == one), int(axis == other)) for axis in range(3)]
+                along = [lattice.integrals(axis, *orders[axis]) for axis in range(3)]
+                matrix[:, one, :, :, :, other] = _product(*along)
+        return matrix
     of = IN_DEPTH if name in (SECOND_IN_DEPTH, THIRD_IN_DEPTH) else LATERAL
     add_scalar(matrix, 1.0, smoothness(lattice, ORDERS[name]), of)
     return matrix
