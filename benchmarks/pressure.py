@@ -10,12 +10,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from benchmarks.field_tracks import Floats, stated_covariance
+from lfpiv_cli.arrays import root_of_squares
 from lfpiv_cli.fields.pressure import knots_for, pressure_field, pressure_gradients
 from lfpiv_cli.fields.stencils import Lattice
 from lfpiv_cli.synthetic.flows import MM_PER_M, KnownFlow, abc, advect, taylor_green
 from lfpiv_cli.tracks.candidates import Seen, Trajectories
 from lfpiv_cli.tracks.in_time import high_derivatives_in, motions_at
-from lfpiv_cli.verbs.field import neglected_share
 
 SIZE_MM = np.array([13.0, 10.0, 10.0])
 FRAMES, MIDDLE = 7, 3
@@ -76,7 +76,8 @@ def trial(flow: KnownFlow, count: int, step_mm: float, seed: int) -> Outcome:
         motion.position_mm, to_m_s2 * motion.acceleration, to_m_s2**2 * motion.covariance, DENSITY_KG_M3
     )
     lattice = Lattice.affordable(-0.5 * SIZE_MM, 0.5 * SIZE_MM, knots_for(samples.points_mm))
-    field = pressure_field(samples, lattice, np.random.default_rng(0), neglected_share(motion))
+    neglected = root_of_squares(motion.neglected) / root_of_squares(motion.acceleration)
+    field = pressure_field(samples, lattice, np.random.default_rng(0), neglected)
     at = nodes()
     found, true = field.value_at(at), flow.pressure(at, DENSITY_KG_M3)
     error, sigma, rms = found - found.mean() - (true - true.mean()), np.sqrt(field.variance_at(at)), np.std(true)

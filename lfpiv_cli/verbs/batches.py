@@ -13,7 +13,7 @@ import json
 import shutil
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass, field
 from functools import partial
@@ -30,7 +30,6 @@ from lfpiv_cli.notice import Notice
 
 Made = TypeVar("Made", covariant=True)
 MB = 1e6
-AT_MOST = "at most, uncompressed"
 # What a file has besides its arrays: its record and those of its inputs, attributes, and space that HDF5 leaves free.
 RECORD_BYTES = 100e3
 
@@ -250,11 +249,25 @@ def carried_out(batch: Batch[Made], options: BatchOptions, console: Console) -> 
     PartialError : outputs could not be made, and the others were
     """
     share, before = _left_of(batch, options, console)
-    if options.dry_run:
-        return _planned(batch, share, before, console)
-    worked = _made(batch, share, before, options, console)
-    batch.end(worked, console)
-    return worked.ensure_whole(batch.summary(worked), batch.unit)
+    if not options.dry_run:
+        worked = _made(batch, share, before, options, console)
+        batch.end(worked, console)
+        return worked.ensure_whole(batch.summary(worked), batch.unit)
+    faults = {number: fault for number in before if (fault := batch.fault(number)) is not None}
+    making, skipped = [number for number in before if number not in faults], sorted(set(share) - set(before))
+    for number in making:
+        if console.verbose:
+            console.answer(f"would make {batch.targets[number].path}")
+    for number, fault in faults.items():
+        console.answer(f"would leave out {batch.names[number]}: {fault}")
+    known = [sum(path.stat().st_size for path in batch.targets[number].paths) for number in skipped]
+    counts = {"to_make": len(making), "skipped": len(skipped), "unreadable": len(faults) + len(batch.left_out)}
+    expected = batch.expected() if making else Expected()
+    reported: dict[str, Any] = {f"{batch.unit}s": len(share)}
+    reported |= estimate(batch.label, counts, known, expected, batch.targets[0].path, console)
+    if console.only_warnings:
+        reported["would_make"] = [str(batch.targets[number].path) for number in making]
+    return reported
 
 
 def work_through(batch: Batch[Made], options: BatchOptions, console: Console) -> Worked[Made]:
@@ -275,8 +288,16 @@ def _made(
     """Make those outputs of a share that are left, and note what became of each."""
     left, worked = list(before), Worked[Made](skipped=len(share) - len(before))
     console.warn(batch.notices)
-    deadline, made_by = options.deadline(), _made_here if options.dask is None else _workers(options.dask)
-    steps = batch.begin(left, console) if options.dask is None else 1.0
+    deadline, steps = options.deadline(), 1.0
+    made_by: Callable[..., Attempts[Made]] = _made_here
+    if options.dask is None:
+        steps = batch.begin(left, console)
+    else:
+        try:
+            from lfpiv_cli.verbs.distributed import made_by_workers
+        except ImportError as error:
+            raise UsageError(f'--dask needs distributed: pip install "lfpiv[cluster]" ({error})') from error
+        made_by = partial(made_by_workers, options.dask)
     # Closed at once where one fails: workers are let go.
     with (
         console.frames(len(left), steps, batch.label, batch.unit) as work,
@@ -321,15 +342,6 @@ def _left_of(batch: Batch[Any], options: BatchOptions, console: Console) -> tupl
     return share, {share[k]: stamp_of(targets[k].path) for k in left}
 
 
-def _workers(address: str) -> Callable[..., Attempts[Any]]:
-    """Return what has outputs made by the workers of a scheduler (UsageError: Dask is not installed)."""
-    try:
-        from lfpiv_cli.verbs.distributed import made_by_workers
-    except ImportError as error:
-        raise UsageError(f'--dask needs distributed: pip install "lfpiv[cluster]" ({error})') from error
-    return partial(made_by_workers, address)
-
-
 def _made_here(batch: Batch[Made], before: Mapping[int, Stamp], deadline: Deadline, work: Frames) -> Attempts[Made]:
     """Make outputs one after the other; what another worker has claimed is asked for again, after all others."""
     left = list(before)
@@ -354,25 +366,6 @@ def _made_here(batch: Batch[Made], before: Mapping[int, Stamp], deadline: Deadli
         left = of_others
 
 
-def _planned(batch: Batch[Any], share: Sequence[int], needed: Iterable[int], console: Console) -> dict[str, Any]:
-    """Return what a batch would make, and what that takes; write nothing."""
-    faults = {number: fault for number in needed if (fault := batch.fault(number)) is not None}
-    making, skipped = [number for number in needed if number not in faults], sorted(set(share) - set(needed))
-    for number in making:
-        if console.verbose:
-            console.answer(f"would make {batch.targets[number].path}")
-    for number, fault in faults.items():
-        console.answer(f"would leave out {batch.names[number]}: {fault}")
-    known = [sum(path.stat().st_size for path in batch.targets[number].paths) for number in skipped]
-    counts = {"to_make": len(making), "skipped": len(skipped), "unreadable": len(faults) + len(batch.left_out)}
-    expected = batch.expected() if making else Expected()
-    reported: dict[str, Any] = {f"{batch.unit}s": len(share)}
-    reported |= estimate(batch.label, counts, known, expected, batch.targets[0].path, console)
-    if console.only_warnings:
-        reported["would_make"] = [str(batch.targets[number].path) for number in making]
-    return reported
-
-
 def estimate(
     label: str, counts: dict[str, int], known: Sequence[int], expected: Expected, place: Path, console: Console
 ) -> dict[str, Any]:
@@ -382,7 +375,7 @@ def estimate(
     """
     count, each, known_by = counts["to_make"], median(known) if known else None, "those that are there"
     if each is None and expected.file_bytes is not None:
-        each, known_by = expected.file_bytes + RECORD_BYTES, AT_MOST
+        each, known_by = expected.file_bytes + RECORD_BYTES, "at most, uncompressed"
     folder = next(path for path in (place.absolute(), *place.absolute().parents) if path.is_dir())
     last = None if console.log is None else console.log.last("frame", step=label)
     logged, held = last or {}, expected.memory_bytes

@@ -68,7 +68,6 @@ LARGEST_MEDIAN_SIGMA = 0.5
 SAME_CORRELATION, STILL_VOXEL = 0.9999, 1e-3
 # A range of displacements leaves out so many percent at either end, where a few are false.
 LEFT_OUT_PERCENT = 5.0
-WINDOWS = "correlation.windows"
 
 
 @dataclass(frozen=True, eq=False)
@@ -207,7 +206,7 @@ def window_notices(volume: Volume, settings: CorrelationSettings, name: str) -> 
         )
         remedy = f"windows as [x, y, z] with fewer voxels along {axis}, or window_mm"
         expected = f"at least {FEWEST_ALONG_AXIS} vectors"
-        yield Notice("windows-too-large", WINDOWS, text, remedy, float(layout.count[fewest]), expected)
+        yield Notice("windows-too-large", "correlation.windows", text, remedy, float(layout.count[fewest]), expected)
     tracers = tracers_per_window(volume.array, layout)
     if tracers < FEWEST_TRACERS:
         text = (

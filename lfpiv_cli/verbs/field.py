@@ -26,7 +26,7 @@ from lfpiv_cli.flow.field import MASKED, MM_TO_M, REJECTED, VectorField
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.names import Divergence
 from lfpiv_cli.tracks.candidates import NO_TRACK, Trajectories
-from lfpiv_cli.tracks.in_time import Motion, high_derivatives_in, motions_at
+from lfpiv_cli.tracks.in_time import high_derivatives_in, motions_at
 from lfpiv_cli.verbs import fields
 from lfpiv_cli.verbs.tracks import seen_in, settings_of, windows_of
 
@@ -89,7 +89,9 @@ def pressure_of(
     sigma = trajectories.arrays["velocity_sigma"][row] * dt_s / MM_TO_M
     moving = Samples(motion.position_mm, motion.velocity, sigma[:, :, np.newaxis] ** 2 * np.eye(3), sure)
     low, high = motion.position_mm.min(axis=0), motion.position_mm.max(axis=0)
-    flow, neglected = fit_field(moving, low, high), neglected_share(motion)
+    flow = fit_field(moving, low, high)
+    # How much of the accelerations is wrong alike among neighbours.
+    neglected = root_of_squares(motion.neglected) / root_of_squares(motion.acceleration)
     accelerated = motion.position_mm, motion.acceleration, motion.covariance, sure
     samples, reported = _gradients(flow, *accelerated, settings, dt_s)
     figures = {"frame": number, "tracks": len(tracks), **reported, "neglected_share": neglected}
@@ -164,11 +166,6 @@ def link_probability(trajectories: Points) -> Floats:
     found = np.ones(int(track.max(initial=-1)) + 1)
     np.multiply.at(found, track, np.nan_to_num(trajectories.arrays["link_probability"], nan=1.0))
     return found
-
-
-def neglected_share(motion: Motion) -> float:
-    """Return how much of the accelerations is wrong alike among neighbours."""
-    return root_of_squares(motion.neglected) / root_of_squares(motion.acceleration)
 
 
 def _on_windows(

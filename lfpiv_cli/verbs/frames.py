@@ -120,10 +120,6 @@ class ImageOptions:
         """Return the files that all frames are made from by their roles."""
         return given(weights=weights, dark=self.dark, background=self.level.path, mask=self.mask_file)
 
-    def dark_image(self, shape: tuple[int, int]) -> Image | None:
-        """Read the dark image."""
-        return image_files.read_reference(self.dark, shape) if self.dark else None
-
 
 def reader(
     level: Background, frames: Sequence[Frame], shape: tuple[int, int], dark: Image | None, keep_going: bool = False

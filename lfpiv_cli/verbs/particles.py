@@ -180,19 +180,15 @@ class Sized(NamedTuple):
     covariance: Floats | None
     is_certain: bool
 
-    def on(self, bench: Bench) -> Bench:
-        """Return the bench with this size."""
-        diffusion, keys = self.size.diffusion, {"particle_diameter_mm": self.size.diameter_mm}
-        if diffusion is not None:
-            keys["diffusion_px"] = diffusion.px
-        settings = bench.settings.overridden("reconstruction", **keys)
-        return replace(bench, settings=settings, light_covariance=self.covariance)
-
 
 def sized(bench: Bench, frames: Iterable[Frame], known: Sized | None = None) -> tuple[Bench, TracerSize]:
     """Return the bench with the tracers' size, and that: as it is known, or by its frames."""
-    found = known or size_of(bench, frames)
-    return found.on(bench), found.size
+    size, covariance, _ = known or size_of(bench, frames)
+    keys = {"particle_diameter_mm": size.diameter_mm}
+    if size.diffusion is not None:
+        keys["diffusion_px"] = size.diffusion.px
+    settings = bench.settings.overridden("reconstruction", **keys)
+    return replace(bench, settings=settings, light_covariance=covariance), size
 
 
 def size_of(bench: Bench, frames: Iterable[Frame]) -> Sized:
@@ -481,11 +477,6 @@ class Prepared:
                 raise InputError(f"{path}: {error}") from error
         return self._searchable[1]
 
-    def bench(self, content: WeightsFile, settings: Config, dark: Image | None, mask: Image | None) -> Bench:
-        """Return what all frames share, with the sums of the last one where these are the same."""
-        self._bench = of_frames.bench_of(content, settings, dark, mask, earlier=self._bench)
-        return self._bench
-
     def reading(
         self,
         content: WeightsFile,
@@ -495,7 +486,8 @@ class Prepared:
         keep_going: bool,
     ) -> tuple[Bench, Read]:
         """Return what frames share, and what reads one; with `keep_going` some may be unreadable."""
-        shape, dark = content.image_shape, options.dark_image(content.image_shape)
+        shape = content.image_shape
+        dark = None if options.dark is None else image_files.read_reference(options.dark, shape)
         pitch_px = float(content.camera.micro_image_lattice_px().pitch.max())
         # What is 0 is left out: as a file has it, or what does not move in the frames (`still`).
         mask = None
@@ -504,5 +496,6 @@ class Prepared:
             mask = np.where(of_images.still_light(images, pitch_px), np.float32(0.0), np.float32(1.0))
         elif options.mask is not None:
             mask = image_files.read_reference(Path(options.mask), shape)
-        bench = self.bench(content, settings, dark, mask)
+        # The sums are those of the last bench where these are the same.
+        self._bench = bench = of_frames.bench_of(content, settings, dark, mask, earlier=self._bench)
         return bench, of_frames.reader(options.level, frames, shape, dark, keep_going)

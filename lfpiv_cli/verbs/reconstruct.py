@@ -177,17 +177,6 @@ def reconstruct_files(
     return carried_out(Reconstruction(weights, images, output, options, overwrite), options, console)
 
 
-@dataclass(frozen=True, eq=False)
-class _Ready:
-    """What all frames share: with particles their size, and what is said of it."""
-
-    bench: Bench
-    ahead: ReadAhead
-    finder: Finder
-    size: TracerSize | None
-    said: Sequence[Notice]
-
-
 @dataclass(eq=False, repr=False)
 class Reconstruction(Batch[Outcome]):
     """The batch of `reconstruct`: a volume, or particles, for each frame.
@@ -247,7 +236,6 @@ class Reconstruction(Batch[Outcome]):
         self.targets = [Target(path, partial(self._record, number)) for number, path in enumerate(self._paths)]
         with_residuals = self._as_particles and options.residual
         self.beside = [of_frames.residual_path(path) for path in self._paths] if with_residuals else []
-        self._ready: _Ready | None = None
 
     def fault(self, number: int) -> str | None:
         """Return why a frame's file cannot be read."""
@@ -289,16 +277,17 @@ class Reconstruction(Batch[Outcome]):
             # The weights are in memory by now.
             ensure_room(held_bytes(voxels, math.prod(content.image_shape)), self.label)
         bench, read = prepared.reading(content, settings, frames, options, options.keep_going)
-        size, said = None, []
+        self._size: TracerSize | None = None
+        self._said: Sequence[Notice] = ()
         if self._as_particles:
             # What cannot be read is told where its turn comes.
             pictures = of_frames.readable(read, self._every, keep_going=True)
             seen = (particles.frame_of(bench, *each) for each in pictures)
-            bench, size = particles.sized(bench, seen, prepared.size)
-            said = size_notices(settings, size)
-            console.warn(said)
-        finder = Finder(bench, read, frames, self._beside, self._first_of, options.keep_going)
-        self._ready = _Ready(bench, ReadAhead(read, numbers), finder, size, said)
+            bench, self._size = particles.sized(bench, seen, prepared.size)
+            self._said = size_notices(settings, self._size)
+            console.warn(self._said)
+        self._bench, self._ahead = bench, ReadAhead(read, numbers)
+        self._finder = Finder(bench, read, frames, self._beside, self._first_of, options.keep_going)
         if not self._as_particles:
             return settings.reconstruction.iterations
         looks = numbers if self._beside is None else {k for number in numbers for k in (number, *self._beside[number])}
@@ -306,15 +295,13 @@ class Reconstruction(Batch[Outcome]):
 
     def make(self, number: int, work: Frames) -> Outcome:
         """Reconstruct a frame, or find its particles, and write them."""
-        if self._ready is None:
-            raise RuntimeError("a batch begins before anything of it is made")
-        ready, bench, name, target = self._ready, self._ready.bench, self.names[number], self.targets[number]
-        pictures = ready.ahead(number)
+        bench, size, name, target = self._bench, self._size, self.names[number], self.targets[number]
+        pictures = self._ahead(number)
         of_frames.check_frame(bench, pictures[0], str(self._frames[number].path))
         made = target.record
         notices = file_notices(made, name) + of_frames.frame_notices(bench, *pictures, name)
         work.console.warn(notices)
-        if ready.size is None:
+        if size is None:
             made = with_warnings(made, notices)
             volume = volume_of(bench, *pictures, made, work.advance)
             array, grid, reference, reported = volume.array, volume.grid, volume.reference, volume.attributes
@@ -326,10 +313,10 @@ class Reconstruction(Batch[Outcome]):
             )
             return Outcome(float(reported["residual"][-1]), reported["excluded_pixels"])
         frame = particles.frame_of(bench, *pictures)
-        found, alone = ready.finder.find(number, frame, work.advance)
+        found, alone = self._finder.find(number, frame, work.advance)
         work.console.warn(alone)
-        made = with_warnings(made, [*ready.said, *notices, *alone])
-        points = particles.points_of(bench, frame, found, ready.size, made)
+        made = with_warnings(made, [*self._said, *notices, *alone])
+        points = particles.points_of(bench, frame, found, size, made)
         of_light = light_notices(points, target.path.name)
         work.console.warn(of_light)
         if self.options.residual:
@@ -339,7 +326,7 @@ class Reconstruction(Batch[Outcome]):
         points = replace(points, provenance=with_warnings(made, of_light))
         write_points(target.path, PARTICLES_FORMAT, points, overwrite=self._replace)
         reported = points.attributes
-        return Outcome(reported["residual"], reported["excluded_pixels"], len(points.position_mm), ready.size)
+        return Outcome(reported["residual"], reported["excluded_pixels"], len(points.position_mm), size)
 
     def summary(self, worked: Worked[Outcome]) -> dict[str, Any]:
         """Return what is told of the batch."""

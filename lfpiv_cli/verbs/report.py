@@ -29,7 +29,6 @@ from lfpiv_cli.files.provenance import sha256
 from lfpiv_cli.files.vtkhdf import open_vectors, read_extra, read_header
 from lfpiv_cli.flow.field import MASKED, MM_TO_M, REJECTED, VALID, VectorField
 from lfpiv_cli.flow.statistics import PAIRS
-from lfpiv_cli.flow.windows import Walls
 from lfpiv_cli.notice import with_error, written
 from lfpiv_cli.pictures.points import MOST_LINES, Lines, displacement_lines, has_views, lines_view, trajectory_lines
 from lfpiv_cli.pictures.style import caption_of
@@ -153,12 +152,16 @@ def _sentence(contents: Contents, fields: Fields, faults: int) -> str:
 
 @dataclass
 class Drawer:
-    """Draws the pictures of files into a folder, over the raw images that these are made from, known by their hash."""
+    """Draws the pictures of files into a folder, over the raw images that these are made from, known by their hash.
+
+    And views of lines that can be turned, of which the first brings what turns them.
+    """
 
     contents: Contents
     folder: Path
     raw: Mapping[str, Path]
     count: int = 0
+    views: int = 0
 
     def pictures(self, path: Path, role: str = "", only: Sequence[str] = ()) -> list[Picture]:
         """Return all pictures of a file, or `only` those of some names; `role` is that of the input to draw on."""
@@ -183,6 +186,18 @@ class Drawer:
             return None, found
         return whole, found + [self._drawn(f"{words}: {caption_of(draw)}", draw(whole)) for draw in draws]
 
+    def view(self, lines: Lines, path: Path, words: str) -> str:
+        """Return words and a view of the lines of a file and of the walls that its config has; "" without lines."""
+        if not (has_views() and lines.places_mm):
+            return ""
+        try:
+            walls = carried_config(self.contents.record(path), "").walls()
+        except (InputError, ConfigError):  # it is not there, or of another version
+            walls = None
+        self.views += 1
+        view = lines_view(lines, walls, name=f"view{self.views}", with_script=self.views == 1)
+        return f"<p>{escape(words)}</p>{view}"
+
     def _drawn(self, caption: str, figure: Figure) -> Picture:
         target = self.folder / f"{self.count:04d}.png"
         self.count += 1
@@ -192,7 +207,7 @@ class Drawer:
 
 def _chain(contents: Contents, fields: Fields, drawer: Drawer) -> Iterable[Section]:
     """Yield the sections of vectors, tracks, images and calibration, as far as they are there."""
-    groups, pictures, views = by_command(contents, fields), list[Picture](), Views()
+    groups, pictures = by_command(contents, fields), list[Picture]()
     if fields:
         first = next(iter(groups.values()))
         # Of many pairs the pictures show what is by other commands, too.
@@ -210,7 +225,7 @@ def _chain(contents: Contents, fields: Fields, drawer: Drawer) -> Iterable[Secti
             else:
                 pictures += drawer.pictures(group[0], only=OF_OTHERS if number else OF_VECTORS)
         words = f"The view can be turned; it shows the vectors of {named}."
-        view = "" if field.dt_s is None else views.of(_of_field(field), contents.record(first[0]), words)
+        view = "" if field.dt_s is None else drawer.view(_of_field(field), first[0], words)
         yield Section("Vectors", "vectors", text, tables=(table,), pictures=tuple(pictures), view=view)
     for path in [path for path in fields if "pairs" in read_header(path).attributes][:1]:
         pictures = drawer.pictures(path, only=OF_STATISTICS)
@@ -222,7 +237,7 @@ def _chain(contents: Contents, fields: Fields, drawer: Drawer) -> Iterable[Secti
             f"the first of {len(tracks)} files, " if len(tracks) > 1 else "",
         )
         words = f"The view can be turned; it shows at most {MOST_LINES:,} tracks of {which}{path.name}, {FAINT_WORDS}."
-        view = views.of(_of_points(points), contents.record(path), words)
+        view = drawer.view(_of_points(points), path, words)
         pictures = drawer.pictures(path, only=OF_TRACKS)
         # On a screen the view shows what the first one does.
         pictures = [replace(each, on_paper=bool(view) and not number) for number, each in enumerate(pictures)]
@@ -358,31 +373,8 @@ def _of_field(field: VectorField) -> Lines:
     return Lines(lines, _twice(rate * np.linalg.norm(moved, axis=1)), rate * np.linalg.norm(sigma, axis=1))
 
 
-@dataclass
-class Views:
-    """The views of a page, of which the first brings what turns them."""
-
-    count: int = 0
-
-    def of(self, lines: Lines, made: Mapping[str, Any], words: str) -> str:
-        """Return words and a view of lines and of the walls that the record of their file has; "" without lines."""
-        if not (has_views() and lines.places_mm):
-            return ""
-        self.count += 1
-        view = lines_view(lines, _walls(made), name=f"view{self.count}", with_script=self.count == 1)
-        return f"<p>{escape(words)}</p>{view}"
-
-
 def _twice(values: Floats) -> list[Floats]:
     return list(np.stack([values, values], axis=1))
-
-
-def _walls(made: Mapping[str, Any]) -> Walls | None:
-    """Return the walls that the config of a record has, if it is there and of this version."""
-    try:
-        return carried_config(made, "").walls()
-    except (InputError, ConfigError):
-        return None
 
 
 def _records(contents: Contents) -> Iterable[Section]:

@@ -11,10 +11,16 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lfpiv_cli.errors import UsageError
-from lfpiv_cli.files import particle_file
 from lfpiv_cli.files.export_formats import Content, columns_of, content_of
 from lfpiv_cli.files.pages import ensure_drawing, package
-from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, POSITION, TRACKS_FORMAT, TRAJECTORIES_FORMAT, Points
+from lfpiv_cli.files.particle_file import (
+    PARTICLES_FORMAT,
+    POSITION,
+    TRACKS_FORMAT,
+    TRAJECTORIES_FORMAT,
+    Points,
+    write_points,
+)
 from lfpiv_cli.files.vtkhdf import VECTORS_FORMAT, VOLUME_FORMAT, Volume, write_vectors, write_volume
 from lfpiv_cli.flow.field import VectorField
 from lfpiv_cli.grid import Grid, Reference
@@ -165,11 +171,6 @@ def _write_weights(content: WeightsFile, path: Path, overwrite: bool) -> None:
     write_weights(path, content, overwrite)
 
 
-def _write_points(result: Points | Tracked, path: Path, overwrite: bool) -> None:
-    points = _points_of(result)
-    particle_file.write_points(path, points.format_name, points, overwrite=overwrite)
-
-
 # By the names of classes, most of which are loaded by who uses them alone.
 KINDS = {
     "Calibration": Kind(
@@ -188,7 +189,9 @@ KINDS = {
     **dict.fromkeys(
         ("Points", "Tracked"),
         Kind(
-            _write_points,
+            lambda result, path, overwrite: write_points(
+                path, _points_of(result).format_name, _points_of(result), overwrite=overwrite
+            ),
             lambda result: (OF_POINTS[_points_of(result).format_name], (_points_of(result),)),
             lambda result: content_of(_points_of(result)),
         ),

@@ -333,7 +333,7 @@ def watch(
         raise InputError(f"{left_out[0].name}: {left_out[0].error}")
     # Through all steps, which are found complete.
     chain = watching.chain(watching.every, replace(console, only_warnings=True), recorded=True)
-    chain.failures = list(left_out)
+    chain.steps.failures.extend(left_out)
     return run_choice.take_all(chain)
 
 
@@ -421,9 +421,10 @@ class Watching:
             fields = run_choice.measured(chain, choice, self._weights)
         except InputError as error:
             fields = {}
-            chain.failures = chain.failures or [Failure(name, str(error))]
-        if chain.failures:
-            self._latest.failed(name, chain.failures[0].error)
+            if not chain.steps.failures:
+                chain.steps.failures.append(Failure(name, str(error)))
+        if chain.steps.failures:
+            self._latest.failed(name, chain.steps.failures[0].error)
         vectors = list(fields.values())[-1] if fields else {}
         if not chain.steps.count(run_steps.MADE):
             self.count += len(vectors)

@@ -83,7 +83,7 @@ def take_all(chain: Chain) -> dict[str, Any]:
     steps.write(whole=True)
     reported |= steps.summary()
     # By both methods a frame fails twice.
-    worked = Worked[None](failures=list(dict.fromkeys(chain.failures)))
+    worked = Worked[None](failures=list(dict.fromkeys(steps.failures)))
     worked.list_failures(options.failures)
     reported["summary"] = in_words(chain, reported, [*fields.values()][-1], worked.failures)
     if worked.failures:

@@ -57,6 +57,7 @@ class Steps:
     recorded : whether they are written down; of several shards none can tell of all
     reported : what it says now
     files : what all steps have made or kept
+    failures : frames and pairs that could not be worked on
     """
 
     output: Path
@@ -66,9 +67,10 @@ class Steps:
     recorded: bool = True
     reported: dict[str, Any] = field(default_factory=lambda: {"steps": {}, "summaries": {}})
     files: list[Path] = field(default_factory=list)
+    failures: list[Failure] = field(default_factory=list)
 
     def take(self, name: str, files: Sequence[Path], make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
-        """Take a step, which makes files; write down and return what it told.
+        """Take a step, which makes files; write down and return what it told, and what of it failed.
 
         Raises
         ------
@@ -86,6 +88,9 @@ class Steps:
         hashes = self._hashes(files)
         try:
             summary = make()
+        except PartialError as error:
+            self.failures.extend(Failure(**each) for each in error.figures["failures"])
+            summary = error.figures
         except LfpivError as error:
             goes_on = number > 1 and not isinstance(error, OutputExistsError)
             done = "; what is done stays, and the same command goes on from there" if goes_on else ""
@@ -222,7 +227,6 @@ class Chain:
     config, settings : the rig file, and what it says
     pairs : of all frames
     prepared : what steps share that takes long to open
-    failures : frames and pairs that could not be worked on
     share : the numbers of the pairs that are to be measured
     order : those of the frames that this takes, and in the last share those without a partner
     """
@@ -243,8 +247,9 @@ class Chain:
         ours = [pairs.pairs[number] for number in self.share]
         alone = pairs.order(len(self.frames))[len({k for pair in pairs.pairs for k in pair}) :]
         self.order = list(dict.fromkeys([*(k for pair in ours for k in pair), *(alone if shard.is_last else [])]))
-        # Of several shards the first one tells them.
-        self.failures = failures_of(pairs) if shard.number == 1 else []
+        if shard.number == 1:
+            # Of several shards the first one tells them.
+            self.steps.failures.extend(failures_of(pairs))
         self.pairs = replace(pairs, left_out=())
 
     @property
@@ -322,7 +327,8 @@ class Chain:
             return self._by_pairs(method, weights)
         if given.follow:
             files, chosen = [*self._of_frames("particles"), tracks, output / PLAYBACK], self.following()
-            self._take("follow", files, lambda: follow_particles(weights, given.images, output, chosen, **self.common))
+            follow = partial(follow_particles, weights, given.images, output, chosen, **self.common)
+            self.steps.take("follow", files, follow)
             return {}
         found, failed = self._reconstructed("particles", weights)
         if given.shard != ALL:
@@ -332,9 +338,9 @@ class Chain:
         grids = grid_paths(tracks, len(found) - 1)
         if failed or len(self.pairs.pairs) < len(grids):
             error = "a frame of the sequence is missing, and tracks would take those beside it for neighbours in time"
-            self.failures.append(Failure(TRACKS, error))
+            self.steps.failures.append(Failure(TRACKS, error))
             return {}
-        self._take("track", [tracks, *grids], lambda: self._worked(self._measured("particles")(found, tracks)))
+        self.steps.take("track", [tracks, *grids], lambda: self._worked(self._measured("particles")(found, tracks)))
         return dict(enumerate(grids))
 
     def in_pairs(self, method: FlowMethod, found: Reconstruction, file_bytes: float | None = None) -> PairByPair[Any]:
@@ -375,7 +381,8 @@ class Chain:
             broken = {number for number, frame in enumerate(self.frames) if frame.stem in failed}
             numbers = [number for number in self.share if not broken & set(self.pairs.pairs[number])]
             if not numbers:
-                raise InputError(f"of every pair a frame has failed, the first because {self.failures[0].error}")
+                why = self.steps.failures[0].error
+                raise InputError(f"of every pair a frame has failed, the first because {why}")
             output = paths[numbers[0]] if len(numbers) == 1 else paths[0].parent
             pairs = [self.pairs.pairs[number] for number in numbers]
             place = {k: place for place, k in enumerate(sorted({k for pair in pairs for k in pair}))}
@@ -385,8 +392,8 @@ class Chain:
                 return self._worked(self._measured(method)([files[k] for k in place], output, pairs=ours))
 
         made = [path for number in numbers for path in dict.fromkeys((paths[number], vectors[number]))]
-        self._take(name, made, make)
-        lost = {failure.name for failure in self.failures}
+        self.steps.take(name, made, make)
+        lost = {failure.name for failure in self.steps.failures}
         return {number: vectors[number] for number in numbers if paths[number].stem not in lost}
 
     def following(self) -> FollowOptions:
@@ -400,28 +407,16 @@ class Chain:
 
     def _reconstructed(self, method: FlowMethod, weights: Path) -> tuple[list[Path], set[str]]:
         """Reconstruct all frames into a folder; return the files, and the names of frames that failed."""
-        paths, before = self._of_frames(method), len(self.failures)
+        paths, before = self._of_frames(method), len(self.steps.failures)
         name = "reconstruct particles" if method == "particles" else "reconstruct"
         made = [paths[k] for k in self.order]
-        self._take(name, made, lambda: self._worked(self.reconstruction(method, weights)))
-        return paths, {failure.name for failure in self.failures[before:]}
+        self.steps.take(name, made, lambda: self._worked(self.reconstruction(method, weights)))
+        return paths, {failure.name for failure in self.steps.failures[before:]}
 
     @property
     def _of_images(self) -> dict[str, Any]:
         """What is taken off images, and left out of them."""
         return {"dark": self.options.dark, "background": self.options.background, "mask": self.options.mask}
-
-    def _take(self, name: str, files: Sequence[Path], make: Callable[[], dict[str, Any]]) -> None:
-        """Take a step of which a part may fail, where the others are to go on."""
-
-        def tolerant() -> dict[str, Any]:
-            try:
-                return make()
-            except PartialError as error:
-                self.failures += [Failure(**each) for each in error.figures["failures"]]
-                return error.figures
-
-        self.steps.take(name, files, tolerant)
 
     def _of_frames(self, folder: str) -> list[Path]:
         """Return the file of each frame in a folder."""
