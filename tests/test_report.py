@@ -234,6 +234,12 @@ def test_the_verdict_is_of_tracks_where_volumes_beside_them_are_poor(tmp_path: P
     (tmp_path / "tracks_grid.vtkhdf").unlink()
     alone = contents_of(tmp_path)
     assert "look" in {line.verdict for line in judged(alone, dict(list(fields.items())[1:]))["vectors"]}
+    # The worst comes first, here after what is said for information.
+    (tmp_path / "vectors.vtkhdf").unlink()
+    put(tmp_path / "vectors.vtkhdf", noise_mm(1), record("correlate", WARNING | {"code": "heavy-work"}))
+    alone = contents_of(tmp_path)
+    fields = {path: open_vectors(path) for path in alone.of("vectors")}
+    assert [line.verdict for line in judged(alone, fields)["vectors"]] == ["look", "good", "good"]
 
 
 def test_many_pairs_stand_in_order_without_empty_settings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

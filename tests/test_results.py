@@ -21,7 +21,7 @@ from lfpiv_cli.flow.field import MASKED, REJECTED, REPLACED, VALID
 from lfpiv_cli.grid import Grid, Reference
 from lfpiv_cli.results import ArrayResult, Result
 from lfpiv_cli.verbs import checks
-from lfpiv_cli.verbs.checks import FOR_INFORMATION, Line, of_two_ways, of_vectors, of_warnings, worst, worst_first
+from lfpiv_cli.verbs.checks import FOR_INFORMATION, Line, of_two_ways, of_vectors, of_warnings, worst
 from lfpiv_cli.verbs.plot import figures_of
 from lfpiv_cli.verbs.results import KINDS
 from tests.commands import ROOT, table2_rig
@@ -259,7 +259,8 @@ def made(command: str, *codes: str) -> dict[str, Any]:
 
 
 def words(lines: list[Line]) -> dict[str, str]:
-    return {part: worst(worst_first(lines, part), "good") for part in ("calibration", "images", "vectors")}
+    parts = ("calibration", "images", "vectors")
+    return {part: worst((line for line in lines if line.about == part), "good") for part in parts}
 
 
 def test_warnings_count_for_the_part_that_their_command_makes() -> None:
@@ -276,7 +277,6 @@ def test_warnings_count_for_the_part_that_their_command_makes() -> None:
     assert "(and 4 more)" in reason.reason
     assert "mend it" in reason.reason
     lines = [Line("images", "good", "fine"), Line("images", "no", "dark"), Line("images", "look", "dim")]
-    assert [each.reason for each in worst_first(lines, "images")] == ["dark", "dim", "fine"]
     assert (worst(lines), worst([])) == ("no", "unknown")
     documented = set(re.findall(r"^\| `([a-z-]+)` \|", TROUBLESHOOTING.read_text(encoding="utf-8"), re.MULTILINE))
     assert documented >= checks.WORTHLESS | FOR_INFORMATION

@@ -24,7 +24,7 @@ from lfpiv_cli.validation import flow as of_flow
 from lfpiv_cli.validation.flow import Duct, Measured, cumulative_distribution, flow_figures, truth_at_points
 from lfpiv_cli.validation.methods import lower_error
 from lfpiv_cli.verbs import validate
-from lfpiv_cli.verbs.validate import _truth_of_particles, light_notices, validate_flow
+from lfpiv_cli.verbs.validate import light_notices, measured_of, validate_flow
 from tests.commands import CONFIG, run, sample_rig, summary_of
 from tests.vector_fields import field_on
 
@@ -389,8 +389,10 @@ def test_light_that_is_fitted_otherwise_is_said_and_truths_that_are_none(tmp_pat
     places = np.stack(np.meshgrid([0.0, 1.0], [0.0, 1.0], [0.0, 1.0, 2.0]), axis=-1).reshape(-1, 3)
     true = Particles(places, np.ones_like(places), (places[:, 2] < 1.5).astype(np.float64))
     write_particles(tmp_path / "true.npz", true, overwrite=False)
-    centres = np.array([[0.5, 0.5, 0.5], [0.5, 0.5, 1.2]])
-    assert _truth_of_particles(tmp_path / "true.npz", centres)[1].tolist() == [True, False]
+    field = field_on(Grid((1, 1, 2), (0.1, 0.1, 0.7), (0.5, 0.5, 0.5)), np.zeros((2, 1, 1, 3)))
+    write_vectors(tmp_path / "vectors.vtkhdf", field, Reference("focal_point", 0.0), provenance={}, overwrite=True)
+    found = measured_of(tmp_path / "vectors.vtkhdf", load_rig(CONFIG), tmp_path / "true.npz", is_simulated=False)
+    assert found.inside.ravel().tolist() == [True, False]
 
 
 def written(report: Path) -> dict[str, Any]:

@@ -89,12 +89,7 @@ CONFIGS = "the config's"
 
 
 class Command(click.Command):
-    """A command whose help shows options in groups, and their defaults."""
-
-    def __init__(self, *arguments: Any, **named: Any) -> None:
-        """Have defaults shown."""
-        named["context_settings"] = {"show_default": True, **(named.get("context_settings") or {})}
-        super().__init__(*arguments, **named)
+    """A command whose help shows options in groups."""
 
     def format_options(self, context: click.Context, formatter: click.HelpFormatter) -> None:
         """Write each option under what it is about."""
@@ -112,7 +107,7 @@ class Command(click.Command):
                     formatter.write_dl(records)
 
 
-command = partial(click.command, cls=Command)
+command = partial(click.command, cls=Command, context_settings={"show_default": True})
 # Whether a file can be read its reader tells: an input's fault, and none of the command line.
 FILE = click.Path(path_type=Path, readable=False)
 POSITIVE = click.FloatRange(min=0.0, min_open=True)

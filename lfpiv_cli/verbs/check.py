@@ -74,12 +74,6 @@ class Seen:
     noise: float
     lens_images: LensImages | None
 
-    @property
-    def above(self) -> Image:
-        """Light above the background, 0 where it is within noise."""
-        rest = self.less_dark - np.float32(self.level)
-        return np.where(rest > light_checks.LIT_SIGMAS * self.noise, rest, np.float32(0.0))
-
 
 def lattice_of(settings: Config, pictures: Pictures) -> tuple[Calibration | None, list[Line]]:
     """Return the microlenses that a white image shows, and what it says of itself."""
@@ -90,8 +84,8 @@ def lattice_of(settings: Config, pictures: Pictures) -> tuple[Calibration | None
         found = calibration_of(settings, photographed)
     except (ConfigError, InputError) as error:
         return None, [Line("white image", "no", str(error))]
-    reported = [each for each in calibration_notices(settings, photographed, found) if each not in (NO_BOARD,)]
-    reported = [each for each in reported if each.code != "f-numbers"]
+    notices = calibration_notices(settings, photographed, found)
+    reported = [each for each in notices if each != NO_BOARD and each.code != "f-numbers"]
     share = float(np.nanmax(pictures.white)) / full_scale(pictures.white, settings)
     reason = f"{found.fit.lenses} lens images {written(float(found.fit.lattice_px.pitch.mean()), 4)} px apart"
     verdict: Verdict = "good"
@@ -250,7 +244,9 @@ def _beyond(bench: Bench, seen: Seen) -> Line:
     knows_mid_plane = bench.found is not None and bench.found.mid_plane_z_mm is not None
     if bench.settings.volume.reference == "mid_plane" and not knows_mid_plane:
         return Line(about, "unknown", "where the volume lies a calibration with a board tells: --calibration")
-    picture = seen.above
+    # Light above the background, 0 where it is within noise.
+    rest = seen.less_dark - np.float32(seen.level)
+    picture = np.where(rest > light_checks.LIT_SIGMAS * seen.noise, rest, np.float32(0.0))
     if bench.found is not None:
         picture = bench.found.rectification.apply(picture).astype(np.float32)
     low, high = bench.bounds_mm[2]

@@ -358,11 +358,6 @@ def worst(lines: Iterable[Line], unsaid: Verdict = "unknown") -> Verdict:
     return max((line.verdict for line in lines), key=ORDER.index, default=unsaid)
 
 
-def worst_first(lines: Iterable[Line], about: str) -> list[Line]:
-    """Return the lines about something, the worst first."""
-    return sorted((each for each in lines if each.about == about), key=lambda each: -ORDER.index(each.verdict))
-
-
 def of_warnings(records: Mapping[str, Mapping[str, Any]]) -> list[Line]:
     """Return what the warnings say that the records of files hold, by the files' names; each once, with its count."""
     seen: dict[tuple[Part, str], list[tuple[str, Mapping[str, Any]]]] = {}

@@ -28,7 +28,12 @@ from lfpiv_cli.files.vtkhdf import VECTORS_FORMAT, VOLUME_FORMAT
 from lfpiv_cli.flow.field import MM_TO_M, REJECTED, VALID, VectorField, derived_fields
 from lfpiv_cli.verbs import checks
 
-# What `info` tells of a file of frames.
+# What `info` tells of a file of frames, and of ours without its numbers.
+
+# Arrays that are told whole: places, sizes, a lattice's basis.
+TOLD_SHAPES = ((2,), (3,), (2, 2))
+# Groups that show our data to other programs once more.
+VIEWS = ("VTKHDF",)
 
 
 def recording_figures(path: Path) -> dict[str, Any]:
@@ -76,16 +81,13 @@ def is_recording(path: Path) -> bool:
         return "format" not in content.attrs
 
 
-# What is in a file of ours, without its numbers.
+def told(path: Path) -> dict[str, Any]:
+    """Return what is told of a file of frames, or of ours.
 
-# Arrays that are told whole: places, sizes, a lattice's basis.
-TOLD_SHAPES = ((2,), (3,), (2, 2))
-# Groups that show our data to other programs once more.
-VIEWS = ("VTKHDF",)
-
-
-def describe(path: Path) -> dict[str, Any]:
-    """Return format, version, how the file was made, and the scalars and the shapes of the arrays in it."""
+    Of ours that is format, version, how it was made, the scalars and the shapes of the arrays in it, and its figures.
+    """
+    if is_recording(path):
+        return recording_figures(path)
     file_format = format_of(path)
     with open_h5(path) as file:
         record = read_provenance(file)
@@ -109,7 +111,7 @@ def describe(path: Path) -> dict[str, Any]:
         if weights:
             found |= {name: weights.get(name) for name in ("method", "refraction", "sampling")}
         _list_group(file, "", found)
-    return found
+    return found | FIGURES.get(file_format, lambda _: {})(path)
 
 
 def _list_group(group: h5py.Group, prefix: str, found: dict[str, Any]) -> None:
@@ -352,7 +354,8 @@ def judged(contents: Contents, fields: Fields) -> dict[checks.Part, list[checks.
         ("vectors", bool(contents.of("vectors") or contents.of("tracks")), "no vectors and no tracks"),
     ]
     reasons += [checks.Line(part, "look", text) for part, there, text in counted if not there]
-    return {part: checks.worst_first(reasons, part) for part, _, _ in counted}
+    reasons.sort(key=lambda line: -checks.ORDER.index(line.verdict))
+    return {part: [line for line in reasons if line.about == part] for part, _, _ in counted}
 
 
 def by_command(contents: Contents, fields: Fields) -> dict[str, list[Path]]:

@@ -21,7 +21,7 @@ from concurrent.futures import CancelledError
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 from uuid import uuid4
 
 import dask
@@ -35,6 +35,7 @@ from lfpiv_cli.files.batch import Stamp
 from lfpiv_cli.files.inputs import Deadline, reason
 from lfpiv_cli.notice import Notice
 from lfpiv_cli.threads import told_threads, use_threads
+from lfpiv_cli.verbs.batches import Batch
 
 # Workers on this machine, as many as it has cores, or `local:4`.
 LOCAL = re.compile(r"local(?::(\d{1,4}))?", re.ASCII)
@@ -57,25 +58,8 @@ class Reply:
     seconds: float = 0.0
 
 
-class AnyBatch(Protocol):
-    """What a batch is to those who hand it out: it begins in each process, and makes one output at a time."""
-
-    label: str
-    unit: str
-
-    @property
-    def names(self) -> Sequence[str]:
-        """What each output is called."""
-
-    def begin(self, numbers: Sequence[int], console: Console) -> float:
-        """Prepare what the outputs of these numbers share."""
-
-    def attempt(self, number: int, before: Stamp, work: Frames) -> Any:
-        """Make an output, unless another worker does or did."""
-
-
 def made_by_workers(
-    address: str, batch: AnyBatch, before: Mapping[int, Stamp], deadline: Deadline, work: Frames
+    address: str, batch: Batch[Any], before: Mapping[int, Stamp], deadline: Deadline, work: Frames
 ) -> Generator[tuple[int, Any], None, None]:
     """Yield outputs with what became of each, as the workers tell it.
 
@@ -128,7 +112,7 @@ def made_by_workers(
 class _Kept(WorkerPlugin):
     """What a worker process keeps of a command: its batch, made when the first output is asked for."""
 
-    def __init__(self, batch: AnyBatch, numbers: Sequence[int], threads: int) -> None:
+    def __init__(self, batch: Batch[Any], numbers: Sequence[int], threads: int) -> None:
         """Take the batch of the command, which travels as its arguments, and all numbers that will be asked for."""
         self.name = f"lfpiv-{uuid4().hex}"
         self._arguments, self._numbers, self._threads = pickle.dumps(batch), numbers, threads
@@ -137,7 +121,7 @@ class _Kept(WorkerPlugin):
     def setup(self, worker: Worker) -> None:
         """Begin in a worker process."""
         self._alone = threading.Lock()
-        self._batch: AnyBatch | None = None
+        self._batch: Batch[Any] | None = None
 
     def make(self, number: int, before: Stamp) -> Reply:
         """Make an output as the command itself would, in its folder; one at a time in each process."""
@@ -156,7 +140,7 @@ class _Kept(WorkerPlugin):
                 # Paths mean what they mean to the command.
                 with contextlib.chdir(self._folder):
                     if self._batch is None:
-                        batch: AnyBatch = pickle.loads(self._arguments)
+                        batch: Batch[Any] = pickle.loads(self._arguments)
                         batch.begin(self._numbers, console)
                         self._batch = batch
                     work = Frames(console, 1, 1.0, self._batch.label, self._batch.unit)

@@ -25,7 +25,7 @@ from lfpiv_cli.pictures import calibration as pictures
 from lfpiv_cli.pictures import points as of_points
 from lfpiv_cli.pictures import vectors
 from lfpiv_cli.pictures.style import caption_of
-from lfpiv_cli.verbs.contents import FIGURES, describe, is_recording, recording_figures
+from lfpiv_cli.verbs.contents import is_recording, told
 from lfpiv_cli.verbs.frames import residual_path
 
 if TYPE_CHECKING:
@@ -342,10 +342,10 @@ def info(
     if picture is None:
         if voxel is not None:
             raise UsageError("--voxel needs --picture")
-        return _told(file)
+        return told(file)
     atomic.ensure_writable(picture, overwrite, [file])
     pages.ensure_drawing()
-    found = _told(file)
+    found = told(file)
     if found["format"] != FORMAT:
         others = "" if is_recording(file) else f"; for the figures of {found['format']}: lfpiv plot {file}"
         raise UsageError(f"--picture draws a voxel of weights{others}")
@@ -356,10 +356,3 @@ def info(
         raise UsageError(f"--voxel {ix} {iy} {iz}: there are {nx} x {ny} x {nz} voxels, counted from 0")
     pages.write_picture(picture, column_of(content, (ix, iy, iz)), overwrite)
     return found
-
-
-def _told(file: Path) -> dict[str, Any]:
-    if is_recording(file):
-        return recording_figures(file)
-    found = describe(file)
-    return found | FIGURES.get(found["format"], lambda _: {})(file)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from lfpiv_cli.arrays import Flags, Floats, Singles
+from lfpiv_cli.arrays import Floats, Singles
 from lfpiv_cli.calibration.board import dots_in_world
 from lfpiv_cli.calibration.model import Photographs, calibrate
 from lfpiv_cli.console import CONSOLE, Console, readable
@@ -419,11 +419,16 @@ def measured_of(vectors: Path, settings: Config, particles: Path | None, is_simu
         raise InputError(f"{vectors}: holds displacements without a time; correlate again with --dt-s")
     if particles:
         # Judged where there are particles, with the config's flow if these follow it, else with theirs.
-        reference = vtkhdf.read_header(vectors).reference
-        truth, inside = _truth_of_particles(particles, reference.points_to_focal_point(field.grid.centres_mm()))
+        reference, true = vtkhdf.read_header(vectors).reference, read_particles(particles)
+        centres_mm = reference.points_to_focal_point(field.grid.centres_mm())
+        lit = true.brightness[:, np.newaxis] > 0.0
+        low = true.positions_mm.min(axis=0, where=lit, initial=np.inf)
+        high = true.positions_mm.max(axis=0, where=lit, initial=-np.inf)
+        inside = np.all((centres_mm >= low) & (centres_mm <= high), axis=-1)
+        truth = truth_at_points(true.positions_mm, true.velocities_m_s, centres_mm)
         if settings.validation.flow is None and settings.simulation.flow is None:
             return Measured(field, truth, inside)
-        flow, true = settings.true_flow(), read_particles(particles)
+        flow = settings.true_flow()
         difference = flow(reference.points_from_focal_point(true.positions_mm)) - true.velocities_m_s
         if np.linalg.norm(difference) > SAME_FLOW * np.linalg.norm(true.velocities_m_s):
             return Measured(field, truth, inside)
@@ -449,16 +454,6 @@ def light_notices(settings: Config) -> list[Notice]:
     text = f"images are simulated {made}, and tracers are fitted {fitted}: particles err more than with the same light"
     remedy = "reconstruction.wavelength_nm as simulation.light has it, or neither"
     return [Notice("light-differs", "simulation.light", text, remedy)]
-
-
-def _truth_of_particles(path: Path, centres_mm: Floats) -> tuple[Floats, Flags]:
-    """Return the true velocities at the window centres, z from the focal point, and which lie among the particles."""
-    particles = read_particles(path)
-    lit = particles.brightness[:, np.newaxis] > 0.0
-    low = particles.positions_mm.min(axis=0, where=lit, initial=np.inf)
-    high = particles.positions_mm.max(axis=0, where=lit, initial=-np.inf)
-    inside = np.all((centres_mm >= low) & (centres_mm <= high), axis=-1)
-    return truth_at_points(particles.positions_mm, particles.velocities_m_s, centres_mm), inside
 
 
 def validate_all(config: Path, output: Path, *, overwrite: bool = False, console: Console = CONSOLE) -> dict[str, Any]:
