@@ -35,7 +35,7 @@ from lfpiv_cli.verbs import checks
 from lfpiv_cli.verbs.batches import ALL, BatchOptions, Expected, Failure, Worked, carried_out, work_through
 from lfpiv_cli.verbs.fields import arrays_of
 from lfpiv_cli.verbs.frames import dt_notices
-from lfpiv_cli.verbs.pairs import PairBatch, PairBatchOptions, coming_pairs, watched, work_as_they_come
+from lfpiv_cli.verbs.pairs import PairBatch, PairOptions, coming_pairs, watched, work_as_they_come
 from lfpiv_cli.verbs.statistics import Mean, are_measured
 
 
@@ -131,7 +131,7 @@ NUMBERS_A_VECTOR, NUMBERS_DERIVED, NUMBER_BYTES = 16, 6, 8
 
 
 @dataclass(frozen=True, kw_only=True)
-class CorrelateOptions(CorrelationKeys, PairBatchOptions):
+class CorrelateOptions(CorrelationKeys, PairOptions):
     """What `correlate` is given besides the volumes, and keys in place of those of the config's section `correlation`.
 
     Attributes
@@ -165,6 +165,10 @@ def correlate_files(
     """Measure the displacements between pairs of volumes.
 
     Of vectors and tracks that are there, in place of volumes, only the `mean` is made.
+
+    Raises
+    ------
+    UsageError : options are of no use for what is given, or something is made from all pairs that are still to come
     """
     if options.mean is not None and not options.watch and are_measured(volumes):
         for each in fields_of(options):
@@ -179,20 +183,9 @@ def correlate_files(
         return carried_out(mean, options, console)
     if output is None:
         raise UsageError("-o: is missing, the file or folder of the vectors; only the --mean of vectors needs none")
-    if options.watch:
-        return _as_they_come(volumes, output, options, overwrite, console)
-    return carried_out(Correlation(volumes, output, options, overwrite), options, console)
-
-
-def _as_they_come(
-    folders: Sequence[Path], output: Path, options: CorrelateOptions, overwrite: bool, console: Console
-) -> dict[str, Any]:
-    """Correlate the volumes of folders that are still being filled, each pair when both are there.
-
-    Raises
-    ------
-    UsageError : something is made from all pairs
-    """
+    if not options.watch:
+        return carried_out(Correlation(volumes, output, options, overwrite), options, console)
+    # Each pair when both are there.
     if options.ensemble or options.mean is not None:
         refused = "--ensemble" if options.ensemble else "--mean"
         raise UsageError(f"--watch: {refused} is made from all pairs, some of which have not come yet; wait for them")
@@ -204,8 +197,8 @@ def _as_they_come(
         two_by_two = tuple((number, number + 1) for number in range(0, len(files), 2))
         return Correlation(files, output, options, overwrite, Pairs(two_by_two))
 
-    come = watched(folders, "results", options, options.idle_s, console)
-    with atomic.folder_of(output / folders[0].name):
+    come = watched(volumes, "results", options, options.idle_s, console)
+    with atomic.folder_of(output / volumes[0].name):
         pairs = coming_pairs(come, results_seen, options, console, left_out)
         groups = ([path for pair in group for path in pair] for group in pairs)
         return work_as_they_come(of_pairs, groups, options, console, left_out)

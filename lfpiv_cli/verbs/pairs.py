@@ -37,8 +37,8 @@ from lfpiv_cli.verbs.frames import residual_path
 
 
 @dataclass(frozen=True, kw_only=True)
-class PairOptions:
-    """How a command is told which frames belong together.
+class PairOptions(BatchOptions):
+    """What a batch is given whose frames belong together: how it is told which do.
 
     Attributes
     ----------
@@ -57,12 +57,7 @@ class PairOptions:
         return any(each is not None for each in (self.pairing, self.pair_by, self.pairs))
 
 
-@dataclass(frozen=True, kw_only=True)
-class PairBatchOptions(PairOptions, BatchOptions):
-    """What a batch of pairs is given."""
-
-
-Chosen = TypeVar("Chosen", bound=PairBatchOptions)
+Chosen = TypeVar("Chosen", bound=PairOptions)
 
 
 class PairBatch(Batch[Made], ABC, Generic[Made, Chosen]):

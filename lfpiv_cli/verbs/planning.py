@@ -199,8 +199,8 @@ def rig_figures(bench: Bench) -> dict[str, Any]:
         "vectors_xyz": list(bench.window_layout.count),
         "expected_velocity_m_s": bench.velocity_m_s,
         "best_dt_s": _best_time_s(bench),
+        "estimated_particles_core_s": TRACER_S * best,
     }
-    figures["estimated_particles_core_s"] = TRACER_S * best
     # Bytes and seconds for one image, where the rig can be worked with at all.
     with contextlib.suppress(ConfigError, InputError):
         figures |= _cost_of(bench).summary() | {

@@ -180,14 +180,9 @@ def of_volume(volume: vtkhdf.Volume) -> Figures:
     }
 
 
-def of_calibration(calibration: Calibration) -> Figures:
-    """Return the figures of a calibration."""
-    return {"summary": partial(pictures.summary_figure, calibration)}
-
-
-def _of_calibration_in(path: Path, white: Path | None) -> Figures:
-    calibration = calibration_file.open_calibration(path)
-    figures = of_calibration(calibration)
+def of_calibration(calibration: Calibration, white: Path | None = None) -> Figures:
+    """Return the figures of a calibration, and of a white image if it is given."""
+    figures: Figures = {"summary": partial(pictures.summary_figure, calibration)}
     if white is not None:
         image = images.read_single(white, calibration.image_shape)
         figures["lattice"] = partial(pictures.calibration_figure, calibration, image)
@@ -238,7 +233,7 @@ READERS: dict[str, Callable[[Path], Figures]] = {
 }
 ON_IMAGES: dict[str, Callable[[Path, Path | None], Figures]] = {
     PARTICLES_FORMAT: _of_particles_in,
-    calibration_file.FORMAT: _of_calibration_in,
+    calibration_file.FORMAT: lambda path, white: of_calibration(calibration_file.open_calibration(path), white),
 }
 
 SUFFIXES = (".png", ".pdf")

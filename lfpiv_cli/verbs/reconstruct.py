@@ -30,7 +30,7 @@ from lfpiv_cli.reconstruction.registry import SolverName
 from lfpiv_cli.reconstruction.solvers import reconstruct as solve
 from lfpiv_cli.verbs import frames as of_frames
 from lfpiv_cli.verbs import particles
-from lfpiv_cli.verbs.batches import Batch, BatchOptions, Expected, Worked, carried_out
+from lfpiv_cli.verbs.batches import Batch, Expected, Worked, carried_out
 from lfpiv_cli.verbs.frames import IMAGE, Bench, ImageOptions, Progress, ReadAhead
 from lfpiv_cli.verbs.pairs import PairOptions, found_pairs, watched, work_as_they_come
 from lfpiv_cli.verbs.particles import Finder, Prepared
@@ -136,7 +136,7 @@ class Outcome:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ReconstructOptions(PairOptions, ImageOptions, BatchOptions):
+class ReconstructOptions(PairOptions, ImageOptions):
     """What `reconstruct` is given besides weights and images.
 
     Attributes

@@ -18,7 +18,7 @@ from lfpiv_cli.console import Console
 from lfpiv_cli.errors import InputError, LfpivError, OutputExistsError, PartialError, StoppedEarlyError
 from lfpiv_cli.files import atomic
 from lfpiv_cli.files.atomic import awaited
-from lfpiv_cli.files.batch import VTKHDF_SUFFIX, Frame, Stamp, Target, stamp_of
+from lfpiv_cli.files.batch import VTKHDF_SUFFIX, Frame, Target, stamp_of
 from lfpiv_cli.files.config import Config
 from lfpiv_cli.files.inputs import Deadline
 from lfpiv_cli.files.pairing import Pairs
@@ -95,7 +95,12 @@ class Steps:
             goes_on = number > 1 and not isinstance(error, OutputExistsError)
             done = "; what is done stays, and the same command goes on from there" if goes_on else ""
             raise type(error)(f"step {number}, {name}: {error}{done}") from error
-        state = _state(files, before, times)
+        state = KEPT
+        if times != [stamp_of(path) for path in files]:
+            # By the records that the files had before.
+            ours = [(old, _recorded(path)) for path, old in zip(files, before, strict=True) if path.suffix in OURS]
+            alike = bool(ours) and all(old and new and old != new and same_result(old, new) for old, new in ours)
+            state = RECORDED if alike else MADE
         if state != MADE:
             why = "complete and made alike" if state == KEPT else "as it depends on nothing that has changed"
             self.console.say(f"step {number}: {state}, {why}")
@@ -157,15 +162,6 @@ def earlier_run(output: Path, overwrite: bool) -> dict[str, Any]:
     return {}
 
 
-def _state(files: Sequence[Path], before: Sequence[Mapping[str, Any] | None], times: Sequence[Stamp]) -> str:
-    """Return what became of files, given the records and times that they had before a step."""
-    if list(times) == [stamp_of(path) for path in files]:
-        return KEPT
-    records = [(old, _recorded(path)) for path, old in zip(files, before, strict=True) if path.suffix in OURS]
-    alike = bool(records) and all(old and new and old != new and same_result(old, new) for old, new in records)
-    return RECORDED if alike else MADE
-
-
 def _recorded(path: Path) -> dict[str, Any] | None:
     """Return the record that a file of ours carries; None where there is none, or a broken one."""
     if path.suffix not in OURS or not path.exists():
@@ -177,7 +173,7 @@ def _recorded(path: Path) -> dict[str, Any] | None:
 
 
 @dataclass(frozen=True, kw_only=True)
-class RunOptions(PairOptions, ImageOptions, BatchOptions):
+class RunOptions(PairOptions, ImageOptions):
     """What `run` is given besides the config; it resumes by itself.
 
     Attributes

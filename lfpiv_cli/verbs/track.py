@@ -28,7 +28,7 @@ from lfpiv_cli.verbs import tracks as of_tracks
 from lfpiv_cli.verbs.batches import Worked, carried_out
 from lfpiv_cli.verbs.fields import fields_of
 from lfpiv_cli.verbs.frames import dt_notices
-from lfpiv_cli.verbs.pairs import PairBatch, PairBatchOptions, doubts
+from lfpiv_cli.verbs.pairs import PairBatch, PairOptions, doubts
 from lfpiv_cli.verbs.tracks import Tracking, TracksOf
 
 # States look at so many frames, one after the other; forecasts at fewer.
@@ -87,7 +87,7 @@ def stored_tracks(
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrackOptions(PairBatchOptions):
+class TrackOptions(PairOptions):
     """What `track_particles` is given besides the particles; where nothing says pairs, they are one sequence.
 
     Attributes
