@@ -321,7 +321,7 @@ def judged(contents: Contents, fields: Fields) -> dict[checks.Part, list[checks.
     others = list(ours)[1:]
     of_others = {name: made for name, made in contents.all_records.items() if checks.verb_of(made) in others}
     records = {name: made for name, made in contents.all_records.items() if name not in of_others}
-    reasons = [*checks.of_warnings(records)]
+    reasons = checks.of_warnings(records)
     faulty: set[Path] = set()
     # What speaks against vectors that better ones by another command stand beside is told, and not counted.
     for number, paths in enumerate(ours.values()):

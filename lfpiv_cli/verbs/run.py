@@ -418,7 +418,7 @@ class Watching:
         begun, name = time.monotonic(), pairs[0][0].path.name
         chain = self.chain(pairs, self._quiet, recorded=False)
         try:
-            fields = run_choice.measured(chain, choice, self._weights)
+            fields = chain.measured(choice.methods, self._weights)
         except InputError as error:
             fields = {}
             if not chain.steps.failures:

@@ -58,7 +58,7 @@ def take_all(chain: Chain) -> dict[str, Any]:
     choice = chosen(chain.settings, options, lambda: counted(chain, weights))
     steps.console.say(f"by {' and '.join(choice.methods)}: {choice.reason}")
     steps.reported.update(choice.reported())
-    fields = measured(chain, choice, weights)
+    fields = chain.measured(choice.methods, weights)
     figures = checks.figures_of({method: list(paths.values()) for method, paths in fields.items()})
     steps.reported["figures"] = figures
     reported = choice.reported() | figures
@@ -113,14 +113,6 @@ def in_words(chain: Chain, reported: Mapping[str, Any], vectors: Vectors, failur
         f"open next: {', '.join(shown)}" if shown else f"all is in {output}",
         f"all figures: --json, -v, or {output / run_steps.RECORD}",
     ]
-
-
-def measured(chain: Chain, choice: Choice, weights: Path) -> dict[str, Vectors]:
-    """Return the files of vectors by each method; those that err least are the last."""
-    fields: dict[str, Vectors] = {method: chain.vectors_by(method, weights) for method in choice.methods}
-    if chain.options.combine:
-        fields["combined"] = chain.combined(fields["volumes"], fields["particles"])
-    return fields
 
 
 def ensure_inputs(settings: Config, options: RunOptions) -> None:

@@ -290,9 +290,13 @@ class Chain:
         self.steps.take("build-weights", [weights], built)
         return weights
 
-    def combined(self, first: Vectors, second: Vectors) -> Vectors:
-        """Weight the vectors of two methods by their uncertainties; return the files."""
-        every = self.of_pairs("combined")
+    def measured(self, methods: Sequence[FlowMethod], weights: Path) -> dict[str, Vectors]:
+        """Measure the flow; return the files of vectors by each method, those that err least as the last."""
+        fields: dict[str, Vectors] = {method: self.vectors_by(method, weights) for method in methods}
+        if not self.options.combine:
+            return fields
+        # Those of both, weighted by their uncertainties.
+        every, first, second = self.of_pairs("combined"), fields["volumes"], fields["particles"]
         paths = {number: every[number] for number in first if number in second}
 
         def combine_all() -> dict[str, Any]:
@@ -303,7 +307,7 @@ class Chain:
             return next(iter(reported.values())) if len(reported) == 1 else reported
 
         self.steps.take("combine", list(paths.values()), combine_all)
-        return paths
+        return fields | {"combined": paths}
 
     def reconstruction(self, method: FlowMethod, weights: Path, to_come: Gone | None = None) -> Reconstruction:
         """Return the batch of the frames of this share, of weights as they are `to_come` if they change."""
