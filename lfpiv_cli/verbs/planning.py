@@ -85,11 +85,6 @@ class Bench:
         return self.camera.scale(self.media)
 
     @property
-    def mid_plane_z_mm(self) -> float:
-        """Depth of a channel's mid plane; where it is not known, the camera is focused on it."""
-        return (self.found.mid_plane_z_mm if self.found else None) or 0.0
-
-    @property
     def bounds_mm(self) -> Floats:
         """(3, 2) of the volume, z from the focal point."""
         return np.array([self.grid.bounds_mm(axis) for axis in range(3)])
@@ -298,7 +293,8 @@ def _source(bench: Bench) -> Source:
     """Return how rays are found; a channel's mid plane that is not known is where the camera is focused."""
     if bench.settings.weights.method == "dlfc":
         return bench.settings.ray_source(bench.found)
-    return bench.settings.plane_space("planning", bench.mid_plane_z_mm)
+    mid_plane_z_mm = bench.found.mid_plane_z_mm if bench.found else None
+    return bench.settings.plane_space("planning", mid_plane_z_mm or 0.0)
 
 
 def _precision(bench: Bench) -> Line:

@@ -11,16 +11,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lfpiv_cli.errors import UsageError
+from lfpiv_cli.files import particle_file
 from lfpiv_cli.files.export_formats import Content, columns_of, content_of
 from lfpiv_cli.files.pages import ensure_drawing, package
-from lfpiv_cli.files.particle_file import (
-    PARTICLES_FORMAT,
-    POSITION,
-    TRACKS_FORMAT,
-    TRAJECTORIES_FORMAT,
-    Points,
-    write_points,
-)
+from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, POSITION, TRACKS_FORMAT, TRAJECTORIES_FORMAT, Points
 from lfpiv_cli.files.vtkhdf import VECTORS_FORMAT, VOLUME_FORMAT, Volume, write_vectors, write_volume
 from lfpiv_cli.flow.field import VectorField
 from lfpiv_cli.grid import Grid, Reference
@@ -189,7 +183,7 @@ KINDS = {
     **dict.fromkeys(
         ("Points", "Tracked"),
         Kind(
-            lambda result, path, overwrite: write_points(
+            lambda result, path, overwrite: particle_file.write_points(
                 path, _points_of(result).format_name, _points_of(result), overwrite=overwrite
             ),
             lambda result: (OF_POINTS[_points_of(result).format_name], (_points_of(result),)),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -41,8 +42,8 @@ class Mean(Batch[None]):
         if resolved is None:
             fields, records = _alike(fields, in_bins=False)
             resolved = records[0].get("config") or {}
-        self.inputs, self._resolved, self._derived, self.overwrite = fields, resolved, derived, overwrite
-        self.targets = [Target(path, self._record)]
+        self.inputs, self._derived, self.overwrite = fields, derived, overwrite
+        self.targets = [Target(path, partial(record, "correlate mean", resolved, _named(fields)))]
 
     def begin(self, numbers: Sequence[int], _console: Console) -> float:
         """Refuse what is too large for the memory."""
@@ -62,9 +63,6 @@ class Mean(Batch[None]):
         found = vtkhdf.open_vectors(self.targets[0].path)
         reported = {"files": len(self.inputs), "skipped": worked.skipped, "vectors": found.flag.size}
         return reported | {"rejected": int(np.count_nonzero(found.flag >= REJECTED))} | quality_of(found).summary()
-
-    def _record(self) -> dict[str, Any]:
-        return record("correlate mean", self._resolved, _named(self.inputs))
 
 
 def _ensure_room(files: Sequence[Path]) -> None:

@@ -155,7 +155,13 @@ def cost_of(settings: Config, camera: Camera, source: Source, grid: Grid) -> Cos
     held = held_bytes(voxels, pixels)
     projections = 2 * settings.reconstruction.iterations
     rays = _rays(settings, source, grid)
-    strips = 0.0 if rays else _strips(camera, source, grid)
+    # In how many strips, and parts of strips, they factorise, 0 where they do in none.
+    strips = 0.0
+    if isinstance(source, CurvedSpace) and not rays:
+        layout = strips_of(camera, source, grid)
+        strips = 0.0 if layout is None else layout.strips * layout.parts
+    elif not rays:
+        strips = float(separates(camera, source, grid))
     if not strips:
         kept = columns_bytes(voxels)
         solving = projections * voxels * COLUMN_BYTES / ENTRY_BYTES / MULTIPLICATIONS_PER_S
@@ -204,14 +210,6 @@ def ensure_volume_fits(settings: Config, by_volumes: bool) -> None:
     voxels, pixels = math.prod(shape), math.prod(settings.image_shape())
     held = held_bytes(voxels, pixels) if by_volumes else float(BYTES_A_VOXEL * voxels)
     ensure_room(held, f"a volume of {shape[0]} x {shape[1]} x {shape[2]} voxels", SMALLER)
-
-
-def _strips(camera: Camera, source: Source, grid: Grid) -> float:
-    """Return in how many strips, and parts of strips, weights factorise, 0 where they do in none."""
-    if isinstance(source, CurvedSpace):
-        layout = strips_of(camera, source, grid)
-        return layout.strips * layout.parts if layout is not None else 0.0
-    return float(separates(camera, source, grid))
 
 
 def held_bytes(voxels: int, pixels: int) -> float:
