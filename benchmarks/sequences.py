@@ -20,6 +20,7 @@ from lfpiv_cli.particles.neighbour_frames import Predicted, find_predicted, seco
 from lfpiv_cli.particles.rounds import first_pass
 from lfpiv_cli.particles.search import Particles, result
 from lfpiv_cli.synthetic.flows import Flow, advect, random_modes, square_duct, taylor_green
+from lfpiv_cli.tracks import sequences
 from lfpiv_cli.tracks.candidates import Light, Seen, long_ones
 from lfpiv_cli.tracks.sequences import PartialTracks, Prediction, begun, expected_in, extended, scatter_in, states_at
 from lfpiv_cli.validation.volume import match
@@ -35,6 +36,7 @@ FLOWS: dict[str, Flow] = {
     "Taylor-Green": taylor_green(3.0 * VOXEL_M_S, 8.0),
     "random modes": random_modes(1.5 * VOXEL_M_S, seed=1),
 }
+# Places of the tracks that are judged.
 SHORTEST = 4
 DISTANCES_MM = ((0.0, np.inf), (0.0, 0.5), (0.5, 2.0), (2.0, np.inf))
 
@@ -112,7 +114,7 @@ def followed_again(
     bench: Bench, images: list[NDArray[np.float32]], found: list[Seen], partial: PartialTracks
 ) -> tuple[list[Seen], PartialTracks]:
     """Return the same after a second pass, in which each frame is expected by its tracks before and after it."""
-    confirmed, again = long_ones(partial.found, SHORTEST), []
+    confirmed, again = long_ones(partial.found, sequences.SHORTEST), []
     for number, image in enumerate(images):
         task = bench.task(image)
         state = find_predicted(task, _predicted(bench, expected_in(confirmed, found, number)))
