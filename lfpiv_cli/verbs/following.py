@@ -222,6 +222,8 @@ class Forwards:
 class BothWays:
     """The second way: each frame is found again where its tracks before and after it let expect its particles.
 
+    Tracks of three places count, too, though four confirm one: what they lead to finds its light there, or not.
+
     Only the frames about the one that is made are held in memory.
 
     Parameters
@@ -233,7 +235,7 @@ class BothWays:
     def __init__(self, sequence: Recorded, found: Trajectories, forward: Callable[[int], Points]) -> None:
         """Take how particles belong together on the way forwards."""
         self._sequence, self._forward = sequence, forward
-        self._confirmed = long_ones(found, sequence.tracking.shortest or SHORTEST)
+        self._followed = long_ones(found, sequences.SHORTEST)
         self._recent: dict[int, Seen] = {}
 
     def find(self, number: int, progress: Progress | None = None) -> Found:
@@ -241,7 +243,7 @@ class BothWays:
         sequence, bench, before = self._sequence, self._sequence.bench, self._recent
         near = range(max(number - REACH_FRAMES, 0), min(number + REACH_FRAMES + 1, len(sequence.names)))
         self._recent = {k: before[k] if k in before else seen_in(self._forward(k)) for k in near}
-        frame, ahead = sequence.frame(number), sequences.expected_in(self._confirmed, self._recent, number)
+        frame, ahead = sequence.frame(number), sequences.expected_in(self._followed, self._recent, number)
         if len(ahead.light):
             return _made(sequence, number, frame, *_next(sequence, number, frame, ahead, progress))
         points, task = self._forward(number), of_particles.task_for(bench, frame)
