@@ -6,7 +6,7 @@ A line is good, or worth a look, or says that the experiment cannot work so; or 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -85,6 +85,11 @@ class Bench:
         return self.camera.scale(self.media)
 
     @property
+    def mid_plane_z_mm(self) -> float:
+        """Depth of a channel's mid plane; where it is not known, the camera is focused on it."""
+        return (self.found.mid_plane_z_mm if self.found else None) or 0.0
+
+    @property
     def bounds_mm(self) -> Floats:
         """(3, 2) of the volume, z from the focal point."""
         return np.array([self.grid.bounds_mm(axis) for axis in range(3)])
@@ -157,20 +162,22 @@ def bench_of(settings: Config, found: Calibration | None, velocity_m_s: float | 
 
 def rig_lines(bench: Bench) -> list[Line]:
     """Return what is to be expected of a rig, a line for each question."""
-    # Of the microlenses that look into the volume.
-    lenses = max(planning.tracers_in(bench.camera, 1.0, bench.sides_mm), 1.0)
-    return [
-        *_optics_lines(bench),
-        _rays(bench),
-        diffraction_line(bench),
-        _precision(bench),
-        seeding_line(bench, bench.settings.simulation.particles / lenses, "simulated"),
-        _voxels(bench),
-        windows_line(bench),
-        _time_step(bench),
-        believed_line(bench),
-        _cost(bench),
-    ]
+    questions: Sequence[Callable[[Bench], Line]] = (
+        _field_of_view,
+        _depth_of_field,
+        _f_numbers,
+        _lens_images,
+        _rays,
+        diffraction_line,
+        _precision,
+        _seeding,
+        _voxels,
+        windows_line,
+        _time_step,
+        believed_line,
+        _cost,
+    )
+    return [question(bench) for question in questions]
 
 
 def rig_figures(bench: Bench) -> dict[str, Any]:
@@ -194,8 +201,8 @@ def rig_figures(bench: Bench) -> dict[str, Any]:
         "vectors_xyz": list(bench.window_layout.count),
         "expected_velocity_m_s": bench.velocity_m_s,
         "best_dt_s": _best_time_s(bench),
-        "estimated_particles_core_s": TRACER_S * best,
     }
+    figures["estimated_particles_core_s"] = TRACER_S * best
     # Bytes and seconds for one image, where the rig can be worked with at all.
     with contextlib.suppress(ConfigError, InputError):
         figures |= _cost_of(bench).summary() | {
@@ -223,37 +230,45 @@ def graded(value: float, good: float, limit: float) -> Verdict:
     return "good" if value <= good else "look" if value <= limit else "no"
 
 
-def _optics_lines(bench: Bench) -> Iterator[Line]:
-    """Yield what main lens and microlenses see of the volume, and how they go together."""
-    camera, media = bench.camera, bench.media
-    share = planning.share_in_view(camera, media, bench.bounds_mm)
-    width, height = 2.0 * planning.half_view_mm(camera, media, [0.0])[0]
-    ends = planning.half_view_mm(camera, media, bench.bounds_mm[2]).min(axis=0)
+def _field_of_view(bench: Bench) -> Line:
+    share = planning.share_in_view(bench.camera, bench.media, bench.bounds_mm)
+    width, height = 2.0 * planning.half_view_mm(bench.camera, bench.media, [0.0])[0]
+    ends = planning.half_view_mm(bench.camera, bench.media, bench.bounds_mm[2]).min(axis=0)
     reason = f"{written(width)} x {written(height)} mm at the focal plane; {share:.0%} of the volume is in full view"
     verdict = graded(share, GOOD_VIEW, LEAST_VIEW)
     if verdict != "good":
         reason += f", {written(2.0 * ends[0])} x {written(2.0 * ends[1])} mm would be at all of its depths"
-    yield Line("field of view", verdict, reason)
-    reach = planning.depth_of_field_mm(camera, media)
+    return Line("field of view", verdict, reason)
+
+
+def _depth_of_field(bench: Bench) -> Line:
+    reach = planning.depth_of_field_mm(bench.camera, bench.media)
     (low, high), inside = bench.bounds_mm[2], np.clip(bench.bounds_mm[2], -reach, reach)
-    deep = float(inside[1] - inside[0]) / float(high - low)
+    share = float(inside[1] - inside[0]) / float(high - low)
     reason = (
         f"points can be refocused within {written(reach)} mm of the focal plane; the volume is {written(low)} to "
         f"{written(high)} mm from it"
     )
-    yield Line("depth of field", graded(deep, GOOD_DEPTH, LEAST_DEPTH), reason)
-    main, ratio = camera.image_distance_mm / camera.aperture_mm, camera.lens_image_width
-    reason = f"f/{written(main)} towards the array and f/{written(main * ratio)} of the microlenses: lens images "
-    if ratio > LARGE_F_RATIO:
-        reason += f"overlap, {ratio:.2f} of their pitch wide; stop the main lens down"
-    elif ratio < 1.0 / LARGE_F_RATIO:
-        reason += f"fill only {ratio:.2f} of their pitch; open the main lens"
+    return Line("depth of field", graded(share, GOOD_DEPTH, LEAST_DEPTH), reason)
+
+
+def _f_numbers(bench: Bench) -> Line:
+    width = bench.camera.lens_image_width
+    main = bench.camera.image_distance_mm / bench.camera.aperture_mm
+    reason = f"f/{written(main)} towards the array and f/{written(main * width)} of the microlenses: lens images "
+    if width > LARGE_F_RATIO:
+        reason += f"overlap, {width:.2f} of their pitch wide; stop the main lens down"
+    elif width < 1.0 / LARGE_F_RATIO:
+        reason += f"fill only {width:.2f} of their pitch; open the main lens"
     else:
         reason += "just touch"
-    yield Line("f-numbers", graded(max(ratio, 1.0 / ratio), LARGE_F_RATIO, LARGEST_F_RATIO), reason)
-    pixels = planning.pixels_per_lens(camera)
+    return Line("f-numbers", graded(max(width, 1.0 / width), LARGE_F_RATIO, LARGEST_F_RATIO), reason)
+
+
+def _lens_images(bench: Bench) -> Line:
+    pixels = planning.pixels_per_lens(bench.camera)
     reason = f"{written(pixels)} pixels across, as many views tell depths apart; {GOOD_PIXELS:g} or more are good"
-    yield Line("lens images", graded(pixels, GOOD_PIXELS, LEAST_PIXELS), reason)
+    return Line("lens images", graded(pixels, GOOD_PIXELS, LEAST_PIXELS), reason)
 
 
 def _rays(bench: Bench) -> Line:
@@ -293,8 +308,7 @@ def _source(bench: Bench) -> Source:
     """Return how rays are found; a channel's mid plane that is not known is where the camera is focused."""
     if bench.settings.weights.method == "dlfc":
         return bench.settings.ray_source(bench.found)
-    mid_plane_z_mm = bench.found.mid_plane_z_mm if bench.found else None
-    return bench.settings.plane_space("planning", mid_plane_z_mm or 0.0)
+    return bench.settings.plane_space("planning", bench.mid_plane_z_mm)
 
 
 def _precision(bench: Bench) -> Line:
@@ -317,6 +331,12 @@ def by_which_light(bench: Bench) -> str:
 def error_verdict(bench: Bench, depth_error_mm: float) -> Verdict:
     """Return the verdict on an error in depth."""
     return graded(depth_error_mm / bench.scale.depth_mm, GOOD_ERROR, LARGEST_ERROR)
+
+
+def _seeding(bench: Bench) -> Line:
+    # Of the microlenses that look into the volume.
+    lenses = max(planning.tracers_in(bench.camera, 1.0, bench.sides_mm), 1.0)
+    return seeding_line(bench, bench.settings.simulation.particles / lenses, "simulated")
 
 
 def seeding_line(bench: Bench, per_lens: float, what: str) -> Line:
