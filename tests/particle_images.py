@@ -43,12 +43,14 @@ def task_for(image: Floats, camera: Camera, media: Media, grid: Grid, radius_mm:
     return task_of(shaped, view, weights, camera, sums, **known)
 
 
-def task_with(table2: Camera, water: Media, true: Floats, rng: np.random.Generator, noise: float = 6.0) -> Task:
-    """Return the task that a noisy image of particles sets; `noise` in counts."""
+def task_with(
+    table2: Camera, water: Media, true: Floats, rng: np.random.Generator, noise: float = 6.0, gain: float = 0.0
+) -> Task:
+    """Return the task that a noisy image of particles sets; `noise` in counts, `gain` in counts a photon's charge."""
     camera = replace(table2, columns=500, rows=420)
     grid = Grid.centred((20, 16, 20), (0.1, 0.1, 0.1), (0.0, 0.0, 1.9))
     image = seen_by(camera, water, true, grid.bounds_mm(2))
-    return task_for(image + rng.normal(0.0, noise, image.size), camera, water, grid)
+    return task_for(image + np.sqrt(noise**2 + gain * image) * rng.normal(size=image.size), camera, water, grid)
 
 
 def rows_of(view: View, place: ArrayLike) -> tuple[NDArray[np.int32], Floats]:
