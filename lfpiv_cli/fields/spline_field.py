@@ -355,7 +355,7 @@ def spline_field(
     about = replace(samples, value_mm=samples.value_mm - mean)
     penalties = stencils.SMOOTHNESS if divergence == "off" else (*stencils.SMOOTHNESS, stencils.DIVERGENCE)
     expected = first_expectation(about, lattice, penalties)
-    # The gradients of a field of wide knots tell what errors of places add; a sample for each unknown tells such one.
+    # The gradients of a field of wide knots show what errors of places add; one sample for each unknown is enough.
     wide = lattice.wide()
     few = np.sort(rng.choice(len(about), min(len(about), wide.unknowns), replace=False))
     part = about.subset(few)

@@ -60,7 +60,7 @@ class Combined(ArrayResult):
     disagreement : (nz, ny, nx) largest difference of the two over its uncertainty, over the components; NaN where one
         has no vector or states no uncertainty
     left_out : (nz, ny, nx) one of the two was left out because they disagree
-    widened : (2, 3) by how much the uncertainties of each field were widened, by component
+    widened : (2, 3) by how much the uncertainties of each field were widened all over, by component
     """
 
     field: VectorField

@@ -134,7 +134,7 @@ def finished(task: Task, state: State, settings: Round) -> State:
     apart, good = separated(task, begin, settings, to_noise=True)
     if good > NEXT_TO_NOISE:
         apart, _ = separated(task, state, settings, to_noise=False)
-    return concluded(task, apart, settings, MOST_JOINS)
+    return concluded(task, apart, settings)
 
 
 def separated(task: Task, state: State, settings: Round, to_noise: bool) -> tuple[State, float]:
@@ -177,17 +177,17 @@ def with_suspects_tried(
     return with_overlaps_split(task, state, fits.chi2, unexplained, good, thorough)
 
 
-def concluded(task: Task, state: State, settings: Round, joins: int = 1) -> State:
+def concluded(task: Task, state: State, settings: Round) -> State:
     """Return the state with those joined that the noise does not tell apart, without those that do not hold.
 
-    Joined ones leave the others other light: up to `joins` times, until hardly any are joined.
+    Joined ones leave the others other light: again, until hardly any are joined.
     """
-    for number in range(joins):
+    for number in range(MOST_JOINS):
         state = with_measured_noise(task, state)
         sweep(task, state, LAST_UNEXPLAINED, LAST_SWEEPS)
         before = len(state.particles)
         state = with_twins_joined(task, state, LAST_UNEXPLAINED, judged(task, state, LAST_UNEXPLAINED).chi2)
-        if number == joins - 1 or before - len(state.particles) <= HARDLY_ANY * before:
+        if number == MOST_JOINS - 1 or before - len(state.particles) <= HARDLY_ANY * before:
             break
         sweep(task, state, LAST_UNEXPLAINED, LAST_SWEEPS)
         fits = judged(task, state, LAST_UNEXPLAINED)

@@ -81,8 +81,8 @@ def is_recording(path: Path) -> bool:
         return "format" not in content.attrs
 
 
-def told(path: Path) -> dict[str, Any]:
-    """Return what is told of a file of frames, or of ours.
+def describe(path: Path) -> dict[str, Any]:
+    """Return what there is to say of a file of frames, or of ours.
 
     Of ours that is format, version, how it was made, the scalars and the shapes of the arrays in it, and its figures.
     """

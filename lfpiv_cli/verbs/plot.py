@@ -25,7 +25,7 @@ from lfpiv_cli.pictures import calibration as pictures
 from lfpiv_cli.pictures import points as of_points
 from lfpiv_cli.pictures import vectors
 from lfpiv_cli.pictures.style import caption_of
-from lfpiv_cli.verbs.contents import is_recording, told
+from lfpiv_cli.verbs.contents import describe, is_recording
 from lfpiv_cli.verbs.frames import residual_path
 
 if TYPE_CHECKING:
@@ -337,10 +337,10 @@ def info(
     if picture is None:
         if voxel is not None:
             raise UsageError("--voxel needs --picture")
-        return told(file)
+        return describe(file)
     atomic.ensure_writable(picture, overwrite, [file])
     pages.ensure_drawing()
-    found = told(file)
+    found = describe(file)
     if found["format"] != FORMAT:
         others = "" if is_recording(file) else f"; for the figures of {found['format']}: lfpiv plot {file}"
         raise UsageError(f"--picture draws a voxel of weights{others}")

@@ -165,6 +165,11 @@ def _write_weights(content: WeightsFile, path: Path, overwrite: bool) -> None:
     write_weights(path, content, overwrite)
 
 
+def _write_points(result: Points | Tracked, path: Path, overwrite: bool) -> None:
+    points = _points_of(result)
+    particle_file.write_points(path, points.format_name, points, overwrite=overwrite)
+
+
 # By the names of classes, most of which are loaded by who uses them alone.
 KINDS = {
     "Calibration": Kind(
@@ -183,9 +188,7 @@ KINDS = {
     **dict.fromkeys(
         ("Points", "Tracked"),
         Kind(
-            lambda result, path, overwrite: particle_file.write_points(
-                path, _points_of(result).format_name, _points_of(result), overwrite=overwrite
-            ),
+            _write_points,
             lambda result: (OF_POINTS[_points_of(result).format_name], (_points_of(result),)),
             lambda result: content_of(_points_of(result)),
         ),

@@ -70,7 +70,7 @@ class Steps:
     failures: list[Failure] = field(default_factory=list)
 
     def take(self, name: str, files: Sequence[Path], make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
-        """Take a step, which makes files; write down and return what it told, and what of it failed.
+        """Take a step, which makes files; write down and return what it reported, and what of it failed.
 
         Raises
         ------
