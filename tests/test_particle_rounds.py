@@ -24,7 +24,7 @@ from lfpiv_cli.synthetic.render import Balls, render_points
 from lfpiv_cli.validation.volume import particle_figures
 from lfpiv_cli.weights.model import Weights
 from tests.commands import WATER
-from tests.particle_images import light_on, seen_by, task_for
+from tests.particle_images import found, light_on, seen_by, task_for
 
 
 def grid_of(shape_xyz: tuple[int, int, int], z_mm: float, spacing_mm: tuple[float, float, float] = (0.1,) * 3) -> Grid:
@@ -316,3 +316,19 @@ def test_errors_of_single_tracers_near_the_focal_plane_are_covered(
     assert np.all(np.mean(np.abs(over_sigma) < 1.96, axis=0) >= least)
     # Nor are errors stated that are much too large: three to five times they were.
     assert np.all(np.median(np.abs(over_sigma), axis=0) > 0.3)
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("seed", [1, 4, 6, 9])
+def test_small_tracers_of_which_a_lens_or_two_are_lit_are_all_found(table2: Camera, water: Media, seed: int) -> None:
+    # Alone, half a millimetre from each other, as bright as any: only its own part of a lens leads a fit to a tracer.
+    rng = np.random.default_rng(seed)
+    camera, grid = replace(table2, columns=500, rows=420), grid_of((24, 20, 36), 0.0)
+    x, y = (each.ravel() for each in np.meshgrid(np.arange(-2, 3) * 0.5, np.arange(-1, 2) * 0.5))
+    depth = rng.uniform(0.4, 1.7, x.size) * rng.choice([-1.0, 1.0], x.size)
+    beside = rng.uniform(-0.1, 0.1, (2, x.size))
+    true = np.column_stack([x + beside[0], y + beside[1], depth, rng.uniform(3e5, 7e5, x.size)])
+    light = light_on(raw_view(camera, water, 0.01), true, grid.bounds_mm(2))
+    image = light + np.sqrt(36.0 + 2.0 * light) * rng.normal(size=light.size)
+    particles = find_particles(task_for(image, camera, water, grid, 0.01)).position_mm
+    np.testing.assert_array_equal(found(particles, true), True)

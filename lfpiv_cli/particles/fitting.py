@@ -42,6 +42,10 @@ from lfpiv_cli.particles.view import View, entry_capacity, over_tiles, type_by_f
 # Candidates are brought into the fit from these depths beside their own, in depths over which light spreads by one lens
 # (Table 2: 0.4 mm).
 START_DEPTHS = np.array([-0.4, 0.0, 0.4]) / 1.064
+# Where light spreads by no more than so many lenses, fits reach a particle only from its own part of a lens: a candidate
+# that does not hold begins again from so far beside it, in lenses.
+FEW_LENSES = 2.0
+START_BESIDE = 0.33 * np.array([(x, y) for x in (-1.0, 0.0, 1.0) for y in (-1.0, 0.0, 1.0) if x or y])
 # Steps from each of these depths; from where that led in the best of them; for a particle in a sweep.
 FIRST_STEPS = 3
 CANDIDATE_STEPS = 12
@@ -379,11 +383,14 @@ def accept(observation: Observation, candidates: Floats, least: Least) -> NDArra
     """Fit candidates (n, 4) in place, one after the other; return which ones stay, their light off the residual."""
     accepted, fitter = np.zeros(len(candidates), np.bool_), fitter_of(observation)
     choice = Choice(Effort(FIRST_STEPS, CHOICE_GAIN), Effort(CANDIDATE_STEPS, CHOICE_GAIN), 1, least.light, np.inf)
-    depths = candidates[:, 2:3] + START_DEPTHS * observation.optics.scale.depth_mm
+    scale = observation.optics.scale
+    depths = candidates[:, 2:3] + START_DEPTHS * scale.depth_mm
     depths = np.clip(depths, observation.low_mm, observation.high_mm)
+    beside_mm = START_BESIDE * scale.lens_mm
+    narrow = np.abs(candidates[:, 2]) < FEW_LENSES * scale.depth_mm
 
     def work(numbers: NDArray[np.int64]) -> None:
-        _accept(fitter, candidates, numbers, choice, depths, least, accepted)
+        _accept(fitter, candidates, numbers, choice, depths, beside_mm, narrow, least, accepted)
 
     over_tiles(work, observation.optics, candidates, observation.depths_mm)
     return accepted
@@ -396,27 +403,43 @@ def _accept(
     numbers: NDArray[np.int64],
     choice: Choice,
     depths: Floats,
+    beside_mm: Floats,
+    narrow: NDArray[np.bool_],
     least: Least,
     accepted: NDArray[np.bool_],
 ) -> None:
     """Do the work of `accept` for the candidates of a tile."""
     observation, _ = fitter.to
-    residual, weight = observation.residual, observation.weight
-    responses, prior = room_for(1, observation.capacity, 0), np.zeros((1, 2 * UNKNOWNS))
-    starts, best = np.empty((depths.shape[1], 1, UNKNOWNS)), np.empty((1, UNKNOWNS))
+    responses, best, count = room_for(1, observation.capacity, 0), np.empty((1, UNKNOWNS)), depths.shape[1]
+    starts, place = np.empty((len(beside_mm) * count, 1, UNKNOWNS)), np.empty(UNKNOWNS)
     for number in numbers:
-        begin_at(observation.optics, candidates[number], depths[number], starts)
-        limits = 0.0, -least.gain
-        if fitter.best(fitter.to, starts, prior, responses, choice, limits, best) >= -least.gain:
-            continue
-        observation.respond(observation.optics, best, responses)
-        pixels, values = lit_by(responses, 0)
-        if seen_share(pixels, values, weight) <= least.seen:
-            continue
-        if claimed_share(pixels, values, best[0, 3], residual, weight, 0.0) >= least.found:
+        begin_at(observation.optics, candidates[number], depths[number], starts[:count])
+        holds = _holds(fitter, starts[:count], responses, choice, least, best)
+        if narrow[number] and not holds:
+            for k in range(len(beside_mm)):
+                place[:] = candidates[number]
+                place[:2] += beside_mm[k]
+                begin_at(observation.optics, place, depths[number], starts[k * count : (k + 1) * count])
+            holds = _holds(fitter, starts, responses, choice, least, best)
+        if holds:
             copy_rows(best, candidates[number : number + 1])
             accepted[number] = True
-            add_light(pixels, values, -best[0, 3], residual)
+            pixels, values = lit_by(responses, 0)
+            add_light(pixels, values, -best[0, 3], observation.residual)
+
+
+@njit(cache=True, nogil=True)
+def _holds(fitter: Fitter, starts: Floats, responses: Responses, choice: Choice, least: Least, best: Floats) -> bool:
+    """Fit a candidate from several starts and fill in the best fit and its response; return whether it holds."""
+    observation, _ = fitter.to
+    residual, weight, prior = observation.residual, observation.weight, np.zeros((1, 2 * UNKNOWNS))
+    if fitter.best(fitter.to, starts, prior, responses, choice, (0.0, -least.gain), best) >= -least.gain:
+        return False
+    observation.respond(observation.optics, best, responses)
+    pixels, values = lit_by(responses, 0)
+    if seen_share(pixels, values, weight) <= least.seen:
+        return False
+    return claimed_share(pixels, values, best[0, 3], residual, weight, 0.0) >= least.found
 
 
 def add_all(view: View, particles: Floats, sign: float, image: Floats, depths_mm: tuple[float, float]) -> None:
