@@ -364,6 +364,9 @@ def verdict(outcome: Outcome) -> str:
     reported = set(codes(outcome.steps)) - ADVICE - {"haze"}
     if outcome.wrong_value and "no-board" in codes(outcome.steps):
         reported.add("no-board")
+    # Of few particles it is said that nothing tells wrong links.
+    if "few-particles" in codes(outcome.steps) and all(fault.startswith("slope") for fault in outcome.faults):
+        reported.add("few-particles")
     return "warned" if reported else "silent"
 
 

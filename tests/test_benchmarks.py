@@ -243,6 +243,9 @@ def test_verdicts_and_their_summary() -> None:
         assert outcome_of(fine | {"recall": 0.4}, Step("track", 0, "", [said], 1.0)).verdict == "silent"
     off = {"magnification_off": -0.004, "magnification_sigma": 0.001}
     assert outcome_of(fine | off, done).faults == ["magnification -0.40 %"]
+    few = Step("track", 0, "", ["lfpiv: warning: a: b; c [few-particles]"], 1.0)
+    assert outcome_of(fine | {"slope_u": 0.5}, few).verdict == "warned"
+    assert outcome_of(fine | {"slope_u": 0.5, "recall": 0.4}, few).verdict == "silent"
     assert outcome_of(fine | off | {"magnification_sigma": 0.002}, done).verdict == "worked"
     # Not sure enough to call it wrong; faint tracers need not be found; of few, coverage says nothing.
     for change in ({"slope_u": 1.03, "slope_u_sigma": 0.01}, {"recall": 0.4, "bright": 0.1}):

@@ -237,6 +237,9 @@ def test_particles_and_tracks_are_those_of_the_commands(by_commands: Path) -> No
         # Those in front of and behind the volume lie before its 30 x 22 microlenses, too.
         before = np.all(np.abs(points.position_mm[:, :2]) <= (1.5, 1.1), axis=1)
         assert points.attributes["particles_per_lens"] == pytest.approx(before.sum() / 660.0, rel=1e-3)
+        # A tracer of 0.05 mm before a lens of 0.1 mm; light spreads by one lens in 1.064 mm of water.
+        in_focus = before & (np.abs(points.reference.points_to_focal_point(points.position_mm)[:, 2]) < 1.064)
+        assert points.attributes["per_lens_in_focus"] == pytest.approx(1.5**2 * in_focus.sum() / 660.0, rel=0.01)
         for array in written.arrays:
             np.testing.assert_array_equal(points.arrays[array], written.arrays[array])
     tracks, written = lf.track(*found), lf.open_tracks(by_commands / "tracks.vtkhdf")

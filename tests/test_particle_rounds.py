@@ -24,7 +24,8 @@ from lfpiv_cli.synthetic.render import Balls, render_points
 from lfpiv_cli.validation.volume import particle_figures
 from lfpiv_cli.weights.model import Weights
 from tests.commands import WATER
-from tests.particle_images import found, light_on, seen_by, task_for
+from tests.particle_images import found as is_found
+from tests.particle_images import light_on, seen_by, task_for
 
 
 def grid_of(shape_xyz: tuple[int, int, int], z_mm: float, spacing_mm: tuple[float, float, float] = (0.1,) * 3) -> Grid:
@@ -331,4 +332,4 @@ def test_small_tracers_of_which_a_lens_or_two_are_lit_are_all_found(table2: Came
     light = light_on(raw_view(camera, water, 0.01), true, grid.bounds_mm(2))
     image = light + np.sqrt(36.0 + 2.0 * light) * rng.normal(size=light.size)
     particles = find_particles(task_for(image, camera, water, grid, 0.01)).position_mm
-    np.testing.assert_array_equal(found(particles, true), True)
+    np.testing.assert_array_equal(is_found(particles, true), True)

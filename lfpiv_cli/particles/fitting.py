@@ -42,8 +42,8 @@ from lfpiv_cli.particles.view import View, entry_capacity, over_tiles, type_by_f
 # Candidates are brought into the fit from these depths beside their own, in depths over which light spreads by one lens
 # (Table 2: 0.4 mm).
 START_DEPTHS = np.array([-0.4, 0.0, 0.4]) / 1.064
-# Where light spreads by no more than so many lenses, fits reach a particle only from its own part of a lens: a candidate
-# that does not hold begins again from so far beside it, in lenses.
+# Where light spreads by no more than so many lenses, fits reach a particle only from its own part of a lens: there a
+# candidate that does not hold begins again from so far beside it, in lenses.
 FEW_LENSES = 2.0
 START_BESIDE = 0.33 * np.array([(x, y) for x in (-1.0, 0.0, 1.0) for y in (-1.0, 0.0, 1.0) if x or y])
 # Steps from each of these depths; from where that led in the best of them; for a particle in a sweep.

@@ -285,6 +285,10 @@ def points_of(bench: Bench, frame: Frame, found: Particles, size: TracerSize, pr
     # How many microlenses the volume fills as the scene shows them; they see what lies in front of and behind it, too.
     camera, (width, height, _) = content.camera, np.diff(bounds)[:, 0]
     lenses = float(width * height) * camera.magnification**2 / camera.lattice.cell_area
+    seen, scale = np.all(within[:, :2], axis=1), camera.scale(bench.settings.media_model())
+    # Where light spreads by less than a lens each lights those that it lies over.
+    narrow = seen & (np.abs(found.position_mm[:, 2]) < scale.depth_mm)
+    lit_by_each = (1.0 + size.diameter_mm / scale.lens_mm) ** 2
     left, haze = what_is_left(frame, found), frame.haze
     norm = root_of_squares(np.where(frame.unusable, 0.0, frame.light))
     share_left = root_of_squares(left) / norm if norm > 0.0 else 0.0
@@ -317,7 +321,8 @@ def points_of(bench: Bench, frame: Frame, found: Particles, size: TracerSize, pr
             "residual_rms_counts": left_rms,
             "excluded_pixels": int(np.count_nonzero(frame.unusable)),
             "read_noise_counts": noise,
-            "particles_per_lens": float(np.count_nonzero(np.all(within[:, :2], axis=1))) / lenses,
+            "particles_per_lens": float(np.count_nonzero(seen)) / lenses,
+            "per_lens_in_focus": lit_by_each * float(np.count_nonzero(narrow)) / lenses,
             "depth_ambiguous": float(np.mean(found.ambiguous[inside])) if inside.any() else 0.0,
             "beyond_depths": float(np.mean(found.beyond)) if inside.size else 0.0,
         }

@@ -22,9 +22,10 @@ LARGEST_UNEXPLAINED = 0.2
 # wrong: fitted by rays, images by rays leave up to 0.05, crowded ones, those by waves 0.065 to 0.11, and near the focal
 # plane 0.65 to 0.7 of their depths are covered. Where hardly any is alike, what is left is noise.
 MUCH_LEFT_ALIKE, LEAST_ALIKE = 0.06, 0.05
-# At so many found for each microlens stated errors begin to cover less than .85: of 1.6 tracers as many are found, and
-# .88 to .94 covered; of 2, of which 1.5 to 1.8 are found, .6 to .7.
-LARGEST_CROWD = 1.4
+# At so many found for each microlens stated errors begin to cover less than .85, and where so many light each microlens
+# next to the focal plane: of random rigs with 1.3 to 1.9 of these .64 to .88 were covered, .79 to .93 of what was found
+# were tracers, with up to 1 .78 to .97.
+LARGEST_CROWD, LARGEST_CROWD_IN_FOCUS = 2.0, 1.2
 # Of tracers at all depths of a usual volume one in seven at most has another depth that fits about as well, in crowds.
 MOST_AMBIGUOUS = 0.25
 # Of tracers in a volume that holds all of them hardly one in a hundred is taken to lie outside its margin; of few one
@@ -247,6 +248,16 @@ def light_notices(points: Points, name: str) -> list[Notice]:
             "fewer tracers, or volumes and their correlation; --background, where other light is in the image",
             crowd,
             f"at most {LARGEST_CROWD:g}",
+        )
+    elif (in_focus := measured.get("per_lens_in_focus", 0.0)) > LARGEST_CROWD_IN_FOCUS:
+        against(
+            "particles-crowded",
+            f"next to the focal plane {written(in_focus)} particles light each microlens, at most "
+            f"{LARGEST_CROWD_IN_FOCUS:g}: beyond, neighbours are taken for one another, and standard errors do not "
+            "know of it",
+            "fewer tracers, or a volume that lies beside the focal plane",
+            in_focus,
+            f"at most {LARGEST_CROWD_IN_FOCUS:g}",
         )
     ambiguous = measured.get("depth_ambiguous", 0.0)
     if ambiguous > MOST_AMBIGUOUS:
