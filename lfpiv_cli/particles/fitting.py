@@ -386,11 +386,11 @@ def accept(observation: Observation, candidates: Floats, least: Least) -> NDArra
     scale = observation.optics.scale
     depths = candidates[:, 2:3] + START_DEPTHS * scale.depth_mm
     depths = np.clip(depths, observation.low_mm, observation.high_mm)
-    beside_mm = START_BESIDE * scale.lens_mm
+    beside = np.pad(START_BESIDE * scale.lens_mm, ((0, 0), (0, 2)))
     narrow = np.abs(candidates[:, 2]) < FEW_LENSES * scale.depth_mm
 
     def work(numbers: NDArray[np.int64]) -> None:
-        _accept(fitter, candidates, numbers, choice, depths, beside_mm, narrow, least, accepted)
+        _accept(fitter, candidates, numbers, choice, depths, beside, narrow, least, accepted)
 
     over_tiles(work, observation.optics, candidates, observation.depths_mm)
     return accepted
@@ -403,7 +403,7 @@ def _accept(
     numbers: NDArray[np.int64],
     choice: Choice,
     depths: Floats,
-    beside_mm: Floats,
+    beside: Floats,
     narrow: NDArray[np.bool_],
     least: Least,
     accepted: NDArray[np.bool_],
@@ -411,14 +411,13 @@ def _accept(
     """Do the work of `accept` for the candidates of a tile."""
     observation, _ = fitter.to
     responses, best, count = room_for(1, observation.capacity, 0), np.empty((1, UNKNOWNS)), depths.shape[1]
-    starts, place = np.empty((len(beside_mm) * count, 1, UNKNOWNS)), np.empty(UNKNOWNS)
+    starts = np.empty((len(beside) * count, 1, UNKNOWNS))
     for number in numbers:
         begin_at(observation.optics, candidates[number], depths[number], starts[:count])
         holds = _holds(fitter, starts[:count], responses, choice, least, best)
         if narrow[number] and not holds:
-            for k in range(len(beside_mm)):
-                place[:] = candidates[number]
-                place[:2] += beside_mm[k]
+            for k in range(len(beside)):
+                place = candidates[number] + beside[k]
                 begin_at(observation.optics, place, depths[number], starts[k * count : (k + 1) * count])
             holds = _holds(fitter, starts, responses, choice, least, best)
         if holds:

@@ -23,6 +23,7 @@ from lfpiv_cli.files.inputs import ensure_room
 from lfpiv_cli.files.particle_file import Points, symmetric
 from lfpiv_cli.files.provenance import record
 from lfpiv_cli.files.weights_file import WeightsFile, open_weights
+from lfpiv_cli.grid import Scale
 from lfpiv_cli.notice import Notice, warn_of
 from lfpiv_cli.optics.curved_space import CurvedSpace
 from lfpiv_cli.optics.tracing import ObjectSpace
@@ -196,7 +197,7 @@ def size_of(bench: Bench, frames: Iterable[Frame]) -> Sized:
 
     By waves with the sensor's charge diffusion.
     """
-    chosen, lens_mm = bench.settings.reconstruction, _lens_mm(bench)
+    chosen, lens_mm = bench.settings.reconstruction, _scale(bench).lens_mm
     given, given_px = chosen.particle_diameter_mm, chosen.diffusion_px
     found = diameter_by(
         (task_for(bench, frame) for frame in islice(frames, LOOKED_AT)), given and given / lens_mm, given_px
@@ -234,15 +235,15 @@ def find_beside(bench: Bench, frame: Frame, own: Floats, neighbours: Sequence[Fl
     return result(task, second_pass(task, own, neighbours))
 
 
-def _lens_mm(bench: Bench) -> float:
-    return bench.content.camera.scale(bench.settings.media_model()).lens_mm
+def _scale(bench: Bench) -> Scale:
+    return bench.content.camera.scale(bench.settings.media_model())
 
 
 def task_for(bench: Bench, frame: Frame) -> Task:
     """Return the task that a frame sets."""
     content, photons = bench.content, bench.settings.reconstruction.photons_per_count
     # By waves for all depths of the weights.
-    margin = BEYOND_DEPTHS * content.camera.scale(bench.settings.media_model()).depth_mm
+    margin = BEYOND_DEPTHS * _scale(bench).depth_mm
     low, high = content.weights.padded.grid.bounds_mm(2)
     view = _view(bench, light_of(bench.settings, (low - margin, high + margin)))
     white = None if content.weights.calibration is None else content.weights.calibration.white
@@ -263,7 +264,7 @@ def task_for(bench: Bench, frame: Frame) -> Task:
 def _view(bench: Bench, waves: Light | None) -> View:
     """Return how particles are seen, by waves or by rays."""
     content, settings = bench.content, bench.settings
-    radius = 0.5 * (settings.reconstruction.particle_diameter_mm or UNKNOWN_LENSES * _lens_mm(bench))
+    radius = 0.5 * (settings.reconstruction.particle_diameter_mm or UNKNOWN_LENSES * _scale(bench).lens_mm)
     calibration, space = content.weights.calibration, _space(content, settings)
     # Particles are fitted behind arrays that stand upright, as in the weights' frame.
     return raw_view(content.camera, settings.media_model(), radius, calibration, space, waves, content.passed)
@@ -285,7 +286,7 @@ def points_of(bench: Bench, frame: Frame, found: Particles, size: TracerSize, pr
     # How many microlenses the volume fills as the scene shows them; they see what lies in front of and behind it, too.
     camera, (width, height, _) = content.camera, np.diff(bounds)[:, 0]
     lenses = float(width * height) * camera.magnification**2 / camera.lattice.cell_area
-    seen, scale = np.all(within[:, :2], axis=1), camera.scale(bench.settings.media_model())
+    seen, scale = np.all(within[:, :2], axis=1), _scale(bench)
     # Where light spreads by less than a lens each lights those that it lies over.
     narrow = seen & (np.abs(found.position_mm[:, 2]) < scale.depth_mm)
     lit_by_each = (1.0 + size.diameter_mm / scale.lens_mm) ** 2
@@ -367,7 +368,7 @@ def tracers_per_lens(bench: Bench, frame: Frame) -> float | None:
     None where too little of the volume is seen. Their size hardly matters to it, and what crowded tracers seem to have
     would: it is taken as half a microlens.
     """
-    settings = bench.settings.overridden("reconstruction", particle_diameter_mm=UNKNOWN_LENSES * _lens_mm(bench))
+    settings = bench.settings.overridden("reconstruction", particle_diameter_mm=UNKNOWN_LENSES * _scale(bench).lens_mm)
     return counted(task_for(replace(bench, settings=settings), frame), bench.lens_images.lattice_px)
 
 

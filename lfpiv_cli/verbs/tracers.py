@@ -22,7 +22,7 @@ LARGEST_UNEXPLAINED = 0.2
 # wrong: fitted by rays, images by rays leave up to 0.05, crowded ones, those by waves 0.065 to 0.11, and near the focal
 # plane 0.65 to 0.7 of their depths are covered. Where hardly any is alike, what is left is noise.
 MUCH_LEFT_ALIKE, LEAST_ALIKE = 0.06, 0.05
-# Of 2 tracers for each microlens .87 to .90 of stated errors are covered and .94 to .96 of what a pair shows are
+# Of 2 tracers for each microlens .87 to .94 of stated errors are covered and .92 to .96 of what a pair shows are
 # tracers, of 3 .85 of what a frame shows. Of ten random rigs whose focal plane holds 1.25 to 2.6 for each microlens .64
 # to .94 are covered (the middle one .81), of 50 with fewer .78 to .98 (.90).
 LARGEST_CROWD, LARGEST_CROWD_IN_FOCUS = 2.0, 1.2
