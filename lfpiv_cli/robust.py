@@ -21,6 +21,8 @@ MEDIAN_TO_MEAN = 1.25
 LEAST_SCATTER = 0.5
 # Bright pixels are as bright as this percentile of all; single ones may be brighter for any reason.
 BRIGHTEST_PERCENTILE = 99.9
+# Of noise of a count and more a larger share of what is below zero is further below than one count.
+FEW_FURTHER = 0.2
 # A pixel counts as lit above this share of the image's bright ones.
 LIT_SHARE = 0.02
 
@@ -67,7 +69,8 @@ def spread_below_zero(values: NDArray[np.floating]) -> float:
     """Return the standard deviation of noise about zero by the values (n,) below it, where no light hides it.
 
     By where those below the last edge between counts that is below zero are halved, and with what rounding adds; 0
-    where there are none.
+    where there are none. Where nearly all of them are one count below, what is left of whole counts less others has no
+    normal distribution: by their squares, with as many of those at zero as belong to them.
     """
     dark = values[values <= 0.0]
     edges, below = number_below(dark) if dark.size else (np.zeros(1), np.zeros(1))
@@ -76,5 +79,7 @@ def spread_below_zero(values: NDArray[np.floating]) -> float:
     if last < 1 or edges[half] == edges[last]:
         return 0.0
     near, far, share = float(edges[last]), float(edges[half]), float(below[half] / below[last])
+    if half == last - 1 and share < FEW_FURTHER:
+        return float(np.sqrt(np.sum(dark**2) / (0.5 * (below[last] + dark.size))))
     spread = brentq(lambda sigma: ndtr(far / sigma) / ndtr(near / sigma) - share, -0.05 * far, -2.0 * far)
     return float(np.hypot(spread, (edges[1] - edges[0]) / np.sqrt(12.0)))

@@ -325,8 +325,21 @@ def test_correlation_is_read_off_what_is_left(rng: np.random.Generator) -> None:
 @pytest.mark.parametrize("spread", [0.4, 0.7, 2.0, 6.3])
 def test_read_noise_of_whole_counts_is_that_of_what_was_rounded(rng: np.random.Generator, spread: float) -> None:
     counts = rng.normal(0.0, spread, 50_000)
+    true = float(np.std(np.rint(counts)))
     counts[::2] += rng.exponential(20.0 * spread, 25_000)
-    assert read_noise(np.rint(counts)) == pytest.approx(np.hypot(spread, ROUNDING_COUNTS), rel=0.06)
+    assert read_noise(np.rint(counts)) == pytest.approx(true, rel=0.06)
+
+
+@pytest.mark.parametrize(("spread", "level"), [(0.2, 100.3), (0.3, 100.0), (0.5, 100.5)])
+def test_read_noise_below_a_count_less_a_dark_image_of_whole_counts(
+    rng: np.random.Generator, spread: float, level: float
+) -> None:
+    """One rounded image less another one has no normal distribution: half or double of its noise was found."""
+    image, dark = np.rint(level + spread * rng.normal(size=(2, 50_000)))
+    less_dark = image - dark
+    true = float(np.std(less_dark))
+    less_dark[::4] += np.rint(rng.exponential(20.0, 12_500))
+    assert read_noise(less_dark) == pytest.approx(true, rel=0.04)
 
 
 def test_noise_of_light_is_found_of_whole_counts(rng: np.random.Generator) -> None:
