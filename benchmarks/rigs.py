@@ -400,9 +400,9 @@ def row(outcome: Outcome) -> str:
 
 
 def so_of(hard: Sequence[str]) -> set[str]:
-    """Return the codes of what is so: refraction by the rig; under hard conditions haze, light from outside."""
+    """Return codes of what is so: lens and refraction by the rig; under hard conditions haze, light from outside."""
     of_hard = {"haze": "haze", "outside": "light-unexplained"}
-    return {"paraxial-refraction"} | {of_hard[each] for each in hard if each in of_hard}
+    return {"paraxial-refraction", "paraxial-lens"} | {of_hard[each] for each in hard if each in of_hard}
 
 
 def summary(outcomes: Sequence[Outcome]) -> str:

@@ -34,6 +34,7 @@ from lfpiv_cli.notice import Notice
 from lfpiv_cli.optics.camera import Camera, Lattice, thin_lens
 from lfpiv_cli.optics.media import Media, Window
 from lfpiv_cli.optics.tracing import refraction_error_mm, sine_error_mm
+from lfpiv_cli.synthetic.render import render_white
 from lfpiv_cli.verbs.build_weights import plan_of
 from lfpiv_cli.verbs.checks import doubt_notices, few_notices, still_notices
 from lfpiv_cli.verbs.tracers import light_notices
@@ -157,6 +158,22 @@ def test_width_of_lens_images_and_what_is_no_lattice(tmp_path: Path) -> None:
     good = white() - 200.0
     for width, found in ((0.87, []), (0.9, []), (0.81, ["aperture-not-as-told"]), (0.99, ["aperture-not-as-told"])):
         assert [each.code for each in white_notices(good, fit_lattice(good), width, 0.9)] == found
+
+
+def test_lens_images_of_long_microlenses_are_as_wide_as_the_data_sheet_says(table2: Camera) -> None:
+    """They lie a tenth further apart than the microlenses, and fill as much less of their pitch."""
+    distance = 0.1 * table2.image_distance_mm
+    camera = replace(
+        table2,
+        columns=240,
+        rows=200,
+        microlens_distance_mm=distance,
+        microlens_focal_length_mm=distance,
+        aperture_mm=9.0 * float(table2.lattice.pitch[0]),
+    )
+    found = lens_image_width(render_white(camera, 1000.0).astype(np.float32), camera.micro_image_lattice_px())
+    assert found == pytest.approx(camera.lens_image_fill, rel=0.03)
+    assert found < 0.95 * camera.lens_image_width
 
 
 def test_residuals_and_f_numbers_that_are_refused(table2: Camera) -> None:

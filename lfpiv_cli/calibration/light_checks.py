@@ -206,7 +206,7 @@ def white_notices(white: Floats, fit: LatticeFit, width: float, sheet_width: flo
     white : (rows, columns) raw, less the dark image
     fit : lattice of its lens images
     width : of the lens images over their pitch, in the image that the transmission is from
-    sheet_width : the same by the data sheet's f-numbers, None where they are not known
+    sheet_width : the same by the data sheet, None where they are not known
     """
     share = residual_share(fit)
     if share > LARGE_RESIDUAL:

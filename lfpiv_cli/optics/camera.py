@@ -253,6 +253,11 @@ class Camera:
         return self.microlens_distance_mm / self.image_distance_mm * self.aperture_mm / float(self.lattice.pitch.mean())
 
     @property
+    def lens_image_fill(self) -> float:
+        """Diameter of a lens image over the pitch of lens images, which lie further apart than the lenses."""
+        return self.lens_image_width / self.micro_image_scale
+
+    @property
     def sensor_centre_px(self) -> Floats:
         """Where the optical axis meets the sensor: (column, row)."""
         return np.array([(self.columns - 1) / 2, (self.rows - 1) / 2])

@@ -348,7 +348,7 @@ def tracers_per_lens(camera: Camera, seen: Sequence[Miniature], lit: tuple[float
     """
     share, level, mean = lit
     pitch, cell = pixels_per_lens(camera), camera.micro_image_lattice_px().cell_area
-    radius = 0.5 * pitch * min(camera.lens_image_width, 1.0) + RIM_PX
+    radius = 0.5 * pitch * min(camera.lens_image_fill, 1.0) + RIM_PX
     most = min(float(np.pi * radius**2 / cell), 1.0)
     if share >= MOST_LIT * most:
         return np.inf, 0.0

@@ -142,7 +142,7 @@ def calibration_notices(rig: Config, pictures: Photographs, found: Calibration) 
     order = by_aperture(pictures.whites, pictures.dark)
     first, widest = (pictures.less_dark(pictures.whites[order[place]]) for place in (0, -1))
     width = lens_image_width(found.rectification.apply(widest), found.rectification.lattice_px)
-    notices += light_checks.white_notices(first, found.fit, width, None if camera is None else camera.lens_image_width)
+    notices += light_checks.white_notices(first, found.fit, width, None if camera is None else camera.lens_image_fill)
     return notices if camera is None else notices + sheet.image_distance_notices(found.fit, camera)
 
 
@@ -152,7 +152,7 @@ def light_notices(rig: Config, pictures: Photographs, found: Calibration) -> lis
     boards = [*([] if pictures.board is None else [pictures.board]), *pictures.depth_boards]
     if found.transmission is None and camera is None:
         return []
-    width = 1.0 if camera is None else camera.lens_image_width
+    width = 1.0 if camera is None else camera.lens_image_fill
     images = LensImages.of(found.rectification, found.transmission, width)
     notices = (
         [] if pictures.dark is None else light_checks.dark_notices(images, np.asarray(pictures.dark, dtype=np.float64))

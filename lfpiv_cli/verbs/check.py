@@ -140,7 +140,7 @@ def _seen(bench: Bench, name: str, raw: Image, dark: Image | None, lattice: Cali
         less_dark, too_bright = np.where(hot, np.float32(0.0), less_dark), too_bright & ~hot
     lens_images = None
     if lattice is not None:
-        width = bench.camera.lens_image_width
+        width = bench.camera.lens_image_fill
         lens_images = LensImages.of(lattice.rectification, lattice.transmission, width)
     # Of the background, between the lens images where it is known where they lie.
     if lens_images is not None:

@@ -314,7 +314,7 @@ def bench_of(
     calibration, camera = weights.calibration, content.camera
     rectification = calibration.rectification if calibration else Rectification(sheet_fit(camera), content.image_shape)
     transmission = calibration.transmission if calibration else None
-    lens_images = LensImages.of(rectification, transmission, camera.lens_image_width)
+    lens_images = LensImages.of(rectification, transmission, camera.lens_image_fill)
     return Bench(content, settings, dark, lasting, excluded, sums, lens_images)
 
 
