@@ -285,6 +285,21 @@ def test_errors_cover_the_lens_that_holds_all_of_the_light(view: View) -> None:
         assert 0.03 < 1.96 * sigma[axis] < 0.06
 
 
+def test_errors_next_to_focus_cover_that_one_may_be_two(view: View, rng: np.random.Generator) -> None:
+    far = np.column_stack([rng.uniform(-1.0, 1.0, (40, 2)), np.full(40, 2.0), TYPICAL * rng.lognormal(0.0, 0.2, 40)])
+    light = TYPICAL * np.array([1.0, 1.2, 1.9, 2.2, 2.2])
+    asked = np.column_stack([np.zeros((5, 2)), [0.1, 0.1, 0.1, -0.4, 2.0], light])
+    particles, known = np.concatenate([far, asked]), np.ones(45, np.bool_)
+    sigma = np.sqrt(np.diagonal(search.of_two(view, particles, known), axis1=1, axis2=2)) / (0.03, 0.03, 0.53, 1.0)
+    # The third part of a lens, and half the depth over which light spreads by one.
+    np.testing.assert_allclose(sigma[42:44, :3], 1.0, atol=0.25)
+    assert (sigma[40:42] < 0.15).all()
+    # Where many lenses are lit one is told from two, and nothing is known of what few tracers' light scatters by.
+    assert not sigma[:40].any()
+    assert not sigma[44].any()
+    assert not search.of_two(view, asked, known[:5]).any()
+
+
 @pytest.mark.thorough
 def test_errors_do_not_grow_for_tracers_lost_elsewhere(table2: Camera, water: Media, rng: np.random.Generator) -> None:
     true = np.array([[-0.6, 0.0, 1.5, 5e5], [0.6, 0.0, 1.5, 5e5]])

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
-from scipy.special import ndtri
+from scipy.special import expit, ndtri
 
 from lfpiv_cli.arrays import Floats
 from lfpiv_cli.optics.camera import Camera
@@ -33,6 +33,7 @@ from lfpiv_cli.particles.noise import (
 )
 from lfpiv_cli.particles.view import View, footprint_radius_mm, lens_pixels, on_array_mm, with_diffusion
 from lfpiv_cli.reconstruction.solvers import Normalisers
+from lfpiv_cli.robust import MAD_TO_SIGMA
 from lfpiv_cli.weights.model import Weights
 
 # Active sets: which particles the next sweep fits again, because their last fit or neighbours' fits changed
@@ -453,6 +454,7 @@ def result(task: Task, state: State) -> Particles:
     share = light_left(task.light[lit], state.residual[lit], noise)
     covariance = grown(task.view, particles, covariance, share, correlation.share)
     covariance, ambiguous = with_other_places(observation, particles, covariance, chi2, correlation.share)
+    covariance = covariance + of_two(task.view, particles, seen > LEAST_SEEN)
     beyond = np.isin(particles[:, 2], task.depths_mm)
     covariance[beyond, 2, 2] += (MARGIN_DEPTHS * task.view.scale.depth_mm) ** 2
     to_world = task.camera.to_image_axes(np.eye(3))
@@ -598,3 +600,46 @@ def with_other_places(
             step[:, :, np.newaxis] * step[:, np.newaxis, :]
         )
     return wider, other[:, 4:].any(axis=1)
+
+
+# Two tracers in one place.
+#
+# Near the focal plane two in a lens, or in two lenses side by side, look like one: on the lenses' boundary, where it
+# would be known to a hundredth of a lens. Only its light says that it is two.
+#
+# Axes: image axes, mm.
+
+
+# Where one of two may lie beside what looks like one: across in lenses, along in depths over which light spreads by one
+# lens.
+OF_TWO_LENSES, OF_TWO_DEPTHS = 0.3, 0.5
+# Tracers' light scatters by this share at least, as far as this is asked; so many of them say by how much.
+LEAST_LIGHT_SCATTER, ENOUGH_LIGHTS = 0.1, 20
+
+
+def of_two(view: View, particles: Floats, known: NDArray[np.bool_]) -> Floats:
+    """Return what is added to covariances (n, 4, 4) of particles (n, 4) near the focal plane that may be two.
+
+    By how likely that is, with light that scatters in proportion: as many tracers as there are for each lens, times how
+    probable the light is of two, over how probable it is of one.
+
+    Parameters
+    ----------
+    known : (n,) which ones are well seen
+    """
+    near, wider = np.abs(particles[:, 2]) < NEAR_DEPTHS * view.scale.depth_mm, np.zeros((len(particles), 4, 4))
+    for usual in (known & ~near, known):
+        if np.count_nonzero(usual) >= ENOUGH_LIGHTS:
+            break
+    else:
+        return wider
+    light = np.log(particles[:, 3] / np.median(particles[usual, 3]))
+    scatter = max(MAD_TO_SIGMA * float(np.median(np.abs(light[usual]))), LEAST_LIGHT_SCATTER)
+    # Of two the mean is known better by the root of two.
+    against = 0.5 * (light / scatter) ** 2 - ((light - np.log(2.0)) / scatter) ** 2
+    per_lens = np.count_nonzero(near) / view.centres_mm[..., 0].size
+    likely = expit(against[near] + np.log(np.sqrt(2.0) * max(per_lens, np.finfo(float).tiny)))
+    side = view.scale.box_mm(OF_TWO_LENSES, OF_TWO_DEPTHS)
+    for axis in range(3):
+        wider[near, axis, axis] = likely * side[axis] ** 2
+    return wider
