@@ -416,6 +416,8 @@ def told_of(**measured: object) -> list[Notice]:
         ({"residual": 0.09, "residual_alike": 0.6}, "light-model", "60% of what is left is alike in pixels"),
         ({"residual": 0.19, "light": "waves"}, "light-model", "wavelength_nm and diffusion_px"),
         ({"residual": 0.21}, "light-unexplained", ""),
+        ({"residual": 0.4, "residual_smooth": 0.05}, None, ""),
+        ({"residual": 0.4, "residual_smooth": 0.25}, "light-unexplained", "25% of the light"),
         ({"particles_per_lens": 0.0}, None, ""),
         ({"particles_per_lens": 1.99}, None, ""),
         ({"particles_per_lens": 2.01}, "particles-crowded", "2.01 particles for each microlens, at most 2"),

@@ -297,8 +297,8 @@ def points_of(bench: Bench, frame: Frame, found: Particles, size: TracerSize, pr
     noise = found.noise.of_dark(None if haze is None else haze.image[~frame.unusable].astype(np.float64))
     # Of four tracers for each microlens only 1.3 are found, and few of them are right. What noise leaves is no light.
     beside = beside_neighbours(left, left.shape[1])[~frame.unusable.ravel()]
-    crowded = share_left**2 * max(left_rms**2 - float(np.mean(beside**2)), 0.0) > (MUCH_LEFT * left_rms) ** 2
-    number = tracers_per_lens(bench, frame) if crowded else None
+    smooth = share_left * float(np.sqrt(max(1.0 - np.mean(beside**2) / left_rms**2, 0.0))) if left_rms > 0.0 else 0.0
+    number = tracers_per_lens(bench, frame) if smooth > MUCH_LEFT else None
     focus = _focal_length(bench, frame, found)
     return Points(
         content.reference.points_from_focal_point(found.position_mm),
@@ -317,6 +317,7 @@ def points_of(bench: Bench, frame: Frame, found: Particles, size: TracerSize, pr
             "refraction": "paraxial" if isinstance(space, ObjectSpace) and space.straight else "exact",
             "light": "rays" if bench.settings.reconstruction.wavelength_nm is None else "waves",
             "residual": share_left,
+            "residual_smooth": smooth,
             "residual_lit": found.left,
             "residual_alike": found.alike,
             "residual_rms_counts": left_rms,

@@ -195,7 +195,9 @@ def light_notices(points: Points, name: str) -> list[Notice]:
     """Return where none were found, there is haze, they crowd, or leave more of the light than noise makes."""
     measured = points.attributes
     noise_share = measured["read_noise_counts"] / max(measured["residual_rms_counts"], measured["read_noise_counts"])
-    unexplained = measured["residual"] * float(np.sqrt(1.0 - min(noise_share, 1.0) ** 2))
+    # Noise that is not known well is none of the light that is alike in pixels side by side.
+    not_noise = measured["residual"] * float(np.sqrt(1.0 - min(noise_share, 1.0) ** 2))
+    unexplained = min(not_noise, measured.get("residual_smooth", 1.0))
     count, notices = len(points.position_mm), haze_notices(measured, name)
 
     def against(code: str, text: str, remedy: str, figure: float, expected: str) -> None:
