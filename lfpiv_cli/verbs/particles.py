@@ -297,7 +297,8 @@ def points_of(bench: Bench, frame: Frame, found: Particles, size: TracerSize, pr
     noise = found.noise.of_dark(None if haze is None else haze.image[~frame.unusable].astype(np.float64))
     # Of four tracers for each microlens only 1.3 are found, and few of them are right. What noise leaves is no light.
     beside = beside_neighbours(left, left.shape[1])[~frame.unusable.ravel()]
-    smooth = share_left * float(np.sqrt(max(1.0 - np.mean(beside**2) / left_rms**2, 0.0))) if left_rms > 0.0 else 0.0
+    not_beside = max(1.0 - float(np.mean(beside**2)) / left_rms**2, 0.0) if left_rms > 0.0 else 0.0
+    smooth = share_left * float(np.sqrt(not_beside))
     number = tracers_per_lens(bench, frame) if smooth > MUCH_LEFT else None
     focus = _focal_length(bench, frame, found)
     return Points(
