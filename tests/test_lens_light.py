@@ -92,6 +92,16 @@ def test_shift_is_found_so_well(images: LensImages, lattice: Lattice, shift: tup
     assert codes(images, tracers(lattice, shift, tilt=tilt)) == (["lens-images-moved"] if any(shift) else [])
 
 
+@pytest.mark.parametrize(("shift_px", "following", "code"), [(2.0, 0.24, True), (0.0, 0.24, False), (2.0, 0.5, False)])
+def test_little_light_that_is_elsewhere_for_certain_is_reported(
+    lattice: Lattice, shift_px: float, following: float, code: bool
+) -> None:
+    """As of 48 tracers in a mirrored picture, where either sign alone may be chance."""
+    beside = Beside((Place(np.array([0.0, shift_px]), 0.25),), following, 0.094, True)
+    known = Mock(lattice_px=lattice, beside=lambda _: beside)
+    assert codes(known, np.zeros(SHAPE)) == (["light-off-lens-images"] if code else [])
+
+
 @pytest.mark.parametrize(("shift_px", "moved"), [(0.2, False), (0.25, True), (0.14, False)])
 def test_a_shift_is_reported_that_is_certainly_harmful(lattice: Lattice, shift_px: float, moved: bool) -> None:
     place = Place(np.array([0.0, shift_px]), 0.04)
@@ -166,6 +176,11 @@ def test_dark_image_with_the_light_on_is_told(images: LensImages, lattice: Latti
     dark[rng.random(SHAPE) < 1e-3] += 500.0
     assert not dark_notices(images, dark)
     assert [notice.code for notice in dark_notices(images, dark + 30.0 * uniform(lattice))] == ["dark-lit"]
+    # Of whole counts without noise a single pixel stands out, here on a lens image.
+    single = np.full(SHAPE, 10.0)
+    place = np.unravel_index(np.argmax(uniform(lattice)), SHAPE)
+    single[place] = 11.0
+    assert not dark_notices(images, single)
 
 
 def test_a_picture_that_was_given_before_is_known() -> None:

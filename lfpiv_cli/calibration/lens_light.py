@@ -180,7 +180,10 @@ class LensImages:
         level = light.mean(axis=(1, 2))
         total = max(float(level.sum()), TINY)
         following = float(system.amount.sum()) / total
-        sigma = float(np.sqrt(np.sum((system.amount - following * level) ** 2))) / total
+        # One part agrees with itself, as where a single pixel is bright.
+        lit = total**2 / max(float(np.sum(level**2)), TINY)
+        apart = float(np.sqrt(np.sum((system.amount - following * level) ** 2))) / total
+        sigma = apart if lit > FEWEST_PARTS else np.inf
         return Beside(tuple(places), following, sigma, float(light.mean()) > TIMES_NOISE * NOISE_LIGHT * noise)
 
     def rim_width_px(self, white: NDArray[np.floating]) -> float:

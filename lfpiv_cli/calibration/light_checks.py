@@ -300,6 +300,8 @@ LARGEST_SHIFT_SHARE, LARGEST_SHIFT_PX = 0.008, 0.15
 LARGEST_BLUR_PX, DIFFRACTED, GREEN_MM = 0.6, 0.45, 5.5e-4
 # In so many standard errors, of as many places and pictures as people have.
 CERTAIN_SIGMAS = 5.0
+# Of two signs together so many are enough.
+BOTH_SIGMAS = 3.0
 # What has moved has moved by more than does no harm where it is this many standard errors beyond.
 HARMFUL_SIGMAS = 2.0
 # Of a picture's light at least so much follows the lens images: haze, tracers and boards do wholly, hot pixels do not.
@@ -332,14 +334,7 @@ def position_notices(images: LensImages, picture: NDArray[np.floating], name: st
     found = images.beside(picture)
     if not found.lit:
         return []
-    following, spread = found.following, CERTAIN_SIGMAS * found.following_sigma
-    if following + spread < LEAST_FOLLOWING:
-        text = (
-            f"{max(following, 0.0):.0%} of its light follows the lens images of the calibration, at "
-            f"least {LEAST_FOLLOWING:.0%} of a good picture's"
-        )
-        other = "is it of the calibrated camera, neither scaled, turned nor mirrored? a --dark takes bright pixels off"
-        return [Notice("light-off-lens-images", name, text, other, following, f"at least {LEAST_FOLLOWING:g}")]
+    following, sigma = found.following, found.following_sigma
     largest = max(LARGEST_SHIFT_SHARE * float(images.lattice_px.pitch.mean()), LARGEST_SHIFT_PX)
     sizes = [(float(np.hypot(*place.shift_px)), place) for place in found.places]
     certain = [
@@ -347,7 +342,16 @@ def position_notices(images: LensImages, picture: NDArray[np.floating], name: st
         for size, place in sizes
         if size > max(largest + HARMFUL_SIGMAS * place.sigma_px, CERTAIN_SIGMAS * place.sigma_px)
     ]
-    if not certain or following - spread <= LEAST_CERTAIN_FOLLOWING:
+    by_chance = following - CERTAIN_SIGMAS * sigma <= LEAST_CERTAIN_FOLLOWING
+    # What seems to have moved for certain, and may be chance, lies elsewhere: as in a mirrored picture of few tracers.
+    if following + (BOTH_SIGMAS if certain and by_chance else CERTAIN_SIGMAS) * sigma < LEAST_FOLLOWING:
+        text = (
+            f"{max(following, 0.0):.0%} of its light follows the lens images of the calibration, at "
+            f"least {LEAST_FOLLOWING:.0%} of a good picture's"
+        )
+        other = "is it of the calibrated camera, neither scaled, turned nor mirrored? a --dark takes bright pixels off"
+        return [Notice("light-off-lens-images", name, text, other, following, f"at least {LEAST_FOLLOWING:g}")]
+    if not certain or by_chance:
         return []
     size, place = max(certain, key=lambda each: each[0])
     text = (
