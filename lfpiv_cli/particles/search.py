@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
-from scipy.special import expit, ndtri
+from scipy.special import ndtri
 
 from lfpiv_cli.arrays import Floats
 from lfpiv_cli.optics.camera import Camera
@@ -618,28 +618,28 @@ LEAST_LIGHT_SCATTER, ENOUGH_LIGHTS = 0.1, 20
 
 
 def of_two(view: View, particles: Floats, known: NDArray[np.bool_]) -> Floats:
-    """Return what is added to covariances (n, 4, 4) of particles (n, 4) near the focal plane that may be two.
+    """Return what is added to covariances (n, 4, 4) of particles (n, 4) near the focal plane that are rather two.
 
-    By how likely that is, with light that scatters in proportion: as many tracers as there are for each lens, times how
-    probable the light is of two, over how probable it is of one.
+    The odds, for light that scatters in proportion, are the tracers that there are for each lens, times how probable
+    the light is of two of them, over how probable it is of one. Where they are about even, nothing is added: of most
+    that may be two a single bright one is known best.
 
     Parameters
     ----------
     known : (n,) which ones are well seen
     """
     near, wider = np.abs(particles[:, 2]) < NEAR_DEPTHS * view.scale.depth_mm, np.zeros((len(particles), 4, 4))
-    for usual in (known & ~near, known):
-        if np.count_nonzero(usual) >= ENOUGH_LIGHTS:
-            break
-    else:
+    enough = [usual for usual in (known & ~near, known) if np.count_nonzero(usual) >= ENOUGH_LIGHTS]
+    if not near.any() or not enough:
         return wider
+    usual = enough[0]
     light = np.log(particles[:, 3] / np.median(particles[usual, 3]))
     scatter = max(MAD_TO_SIGMA * float(np.median(np.abs(light[usual]))), LEAST_LIGHT_SCATTER)
-    # Of two the mean is known better by the root of two.
-    against = 0.5 * (light / scatter) ** 2 - ((light - np.log(2.0)) / scatter) ** 2
     per_lens = np.count_nonzero(near) / view.centres_mm[..., 0].size
-    likely = expit(against[near] + np.log(np.sqrt(2.0) * max(per_lens, np.finfo(float).tiny)))
+    # Of two the logarithm scatters by less, by the root of two.
+    odds = 0.5 * (light / scatter) ** 2 - ((light - np.log(2.0)) / scatter) ** 2
+    odds += np.log(np.sqrt(2.0) * per_lens)
     side = view.scale.box_mm(OF_TWO_LENSES, OF_TWO_DEPTHS)
     for axis in range(3):
-        wider[near, axis, axis] = likely * side[axis] ** 2
+        wider[near & (odds > 0.0), axis, axis] = side[axis] ** 2
     return wider
