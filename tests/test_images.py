@@ -174,6 +174,18 @@ def test_haze_of_few_counts_is_found_where_a_count_is_of_many_photons(
     assert error > haze
 
 
+def test_haze_between_two_counts_is_not_one_of_them(camera: Camera, water: Media, rng: np.random.Generator) -> None:
+    """Of noise of a sixth of a count most pixels have one count or the next: 1 was found of 0.6 to 1.6, or 2 of it."""
+    camera = replace(camera, columns=400, rows=320)
+    true, white = white_light(camera, rng)
+    light = 0.02 * tracers(camera, water, 0.1, rng) + true * np.linspace(2.0, 1.0, 400)
+    # A dark level of 2.6 counts is recorded as 3.
+    recorded = Readout(50.0, 0.06, 0.0).record(light + 2.6, rng).astype(np.float32) - 3.0
+    found, _ = white.haze_in(recorded, np.ones(light.shape, np.bool_), (0.0, 0.3), 0.0)
+    assert found is not None
+    assert np.percentile(np.abs(found.image - np.linspace(1.6, 0.6, 400))[true > 0.95], 90.0) < 0.25
+
+
 @pytest.mark.parametrize("photons_per_count", [0.5, 0.01])
 def test_tracers_are_no_haze(camera: Camera, water: Media, rng: np.random.Generator, photons_per_count: float):
     """Of four for each microlens a third of the light is in the darkest pixels of all."""

@@ -52,7 +52,7 @@ LEAST_DARK, LEAST_SIGMAS = 0.05, 2.5
 MUCH_DARK, LEAST_SIGMAS_OF_DARK = 0.15, 0.4
 # Of fewer counts rounding leaves nothing or a whole one; a dark level that drifts is that of pixels between the lens
 # images, too. Whole counts are steps: the search begins no finer, and texture is looked at as far as the next count.
-LEAST_COUNTS, STEP_COUNTS = 0.5, 1.0
+LEAST_COUNTS, STEP_COUNTS, NEXT_COUNT = 0.5, 1.0, 1.1
 # Rounding hides so much of the level between lens images, above which haze is (standard error).
 ROUNDING_COUNTS = 0.29
 # Where few pixels lie between lens images haze may be their level's error: it is above this many of it.
@@ -156,7 +156,8 @@ class White:
         haze, sigma = found[0], max(found[1], noise, UNEVENNESS * float(np.median(found[0])), STEP_COUNTS)
         rest, whole = light - _between(haze, places), self._smoothed(pixels)
         for _ in range(ROUNDS):
-            core = np.abs(rest) < CORE_SIGMAS * sigma
+            # To the next count at least: haze between two that are further apart than the noise would be one of them.
+            core = np.abs(rest) < max(CORE_SIGMAS * sigma, NEXT_COUNT)
             total, count = self._smoothed(pixels[core], rest[core]), self._smoothed(pixels[core])
             haze = haze + total / np.maximum(count, LEAST_PIXELS)
             # Where hardly a pixel is dark it is as in the nearest microlenses where some are.
