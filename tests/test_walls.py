@@ -18,7 +18,7 @@ from lfpiv_cli.particles.view import raw_view, with_radius
 from lfpiv_cli.self_calibration.nuisances import MovableScene, Nuisances, fit_nuisances, moved_places
 from lfpiv_cli.self_calibration.refinement import Refinement
 from lfpiv_cli.self_calibration.scene_refinement import SceneRefinement, together, wall_by_places
-from lfpiv_cli.self_calibration.walls import Walls, find_round_wall, find_walls
+from lfpiv_cli.self_calibration.walls import Walls, find_round_wall, find_walls, most_likely
 from lfpiv_cli.verbs.refine import scene_notices
 from tests.commands import ROOT
 from tests.known_rays import tube_of
@@ -84,6 +84,20 @@ def test_what_shows_no_wall_is_refused(rng: np.random.Generator) -> None:
     ):
         with pytest.raises(InputError, match=words):
             find_round_wall(shown, error[: len(shown)], 5.0, 5.4)
+
+
+def test_what_makes_no_particle_likelier_is_not_known(rng: np.random.Generator) -> None:
+    """Its variance was nothing, or a rounding error's root, where the particles of a white image end nowhere."""
+    depth = rng.normal(size=200)
+
+    def likelihood(packed: Floats) -> Floats:
+        return -0.5 * (depth - packed[0]) ** 2
+
+    with pytest.raises(InputError, match="shows no walls"):
+        most_likely(np.zeros(8), [0], [0, 1], 4, (0.1,), likelihood)
+    best, covariance = most_likely(np.zeros(8), [0], [0], 4, (0.1,), likelihood)
+    assert best[0] == pytest.approx(depth.mean(), abs=1e-4)
+    assert covariance[0, 0] == pytest.approx(1.0 / 200.0, rel=0.2)
 
 
 def test_the_picture_shows_all_particles_and_both_walls(rng: np.random.Generator) -> None:

@@ -42,6 +42,11 @@ def most_likely(
 
     The first ones are sought with edges of each blur, coarse to fine, then all that are free; the others are left as
     they are, and have no variance. The covariance is from the scatter of the single particles' slopes.
+
+    Raises
+    ------
+    InputError
+        Something that is sought makes no particle likelier than another does: they end at no walls.
     """
     for blur, sought in [*((blur, first) for blur in blurs), (None, free)]:
         if blur is not None:
@@ -58,7 +63,10 @@ def most_likely(
     step = SLOPE_STEP * np.where(np.isin(np.arange(len(best)), free), _units(best, places), 0.0)
     slopes = [(log_likelihood(best + change) - log_likelihood(best - change)) / 2.0 for change in np.diag(step)]
     design = np.stack(slopes, axis=1)
-    return best, np.asarray(np.linalg.pinv(design.T @ design) * np.outer(step, step), dtype=np.float64)
+    covariance = np.asarray(np.linalg.pinv(design.T @ design) * np.outer(step, step), dtype=np.float64)
+    if not (np.diag(covariance)[free] > 0.0).all():
+        raise InputError("where the particles end shows no walls; are they tracers, and is the whole depth seeded?")
+    return best, covariance
 
 
 def _units(packed: Floats, places: int) -> Floats:
