@@ -621,8 +621,8 @@ def of_two(view: View, particles: Floats, known: NDArray[np.bool_]) -> Floats:
     """Return what is added to covariances (n, 4, 4) of particles (n, 4) near the focal plane that are rather two.
 
     The odds, for light that scatters in proportion, are the tracers that there are for each lens, times how probable
-    the light is of two of them, over how probable it is of one. Where they are about even, nothing is added: of most
-    that may be two a single bright one is known best.
+    the light is of two of them, over how probable it is of one. Where one is likelier nothing is added: among those are
+    the brightest tracers, which are known best.
 
     Parameters
     ----------
