@@ -294,7 +294,7 @@ def test_errors_next_to_focus_cover_that_one_may_be_two(view: View, rng: np.rand
     # The third part of a lens, and half the depth over which light spreads by one.
     np.testing.assert_allclose(sigma[42:44, :3], 1.0, rtol=0.01)
     assert not sigma[40:42].any()
-    # Where many lenses are lit one is told from two, and nothing is known of what few tracers' light scatters by.
+    # Where many lenses are lit one is no two, and nothing is known of what few tracers' light scatters by.
     assert not sigma[:40].any()
     assert not sigma[44].any()
     assert not search.of_two(view, asked, known[:5]).any()
