@@ -267,14 +267,19 @@ def test_pitch_rotation_and_origin_are_found_from_the_lens_in_the_middle(layout:
     np.testing.assert_array_equal(fit.indices[np.argmin(distance)], [0, 0])
 
 
-@pytest.mark.parametrize("pitch", [8.0, 10.0])
-def test_whole_pixels_between_lens_images_are_no_distortion(pitch: float, rng: np.random.Generator) -> None:
-    """As behind a telecentric lens: the centroids' own error within a pixel changes slowly from lens to lens."""
-    truth = tilted("square", pitch, 0.3)
+@pytest.mark.parametrize(
+    ("layout", "pitch", "angle_deg"), [("square", 8.0, 0.3), ("square", 10.0, 0.3), ("hexagonal", 8.12, 0.1)]
+)
+def test_whole_pixels_between_lens_images_are_no_distortion(
+    layout: str, pitch: float, angle_deg: float, rng: np.random.Generator
+) -> None:
+    """As behind a telecentric lens, or where rows of hexagons are: a centroid's own error changes slowly over them."""
+    truth = tilted(layout, pitch, angle_deg)
     fit = fit_lattice(disc_image(truth, rng, 0.48))
     assert not fit.cubic_used
     found = fit.centres(fit.indices)
-    assert np.abs(found - truth.points(truth.nearest(found))).max() < 0.03  # a cubic is 0.1 px off
+    # The centroids themselves leave 0.02 to 0.035 px, and a cubic through them 0.1; 4 % noise leaves 0.003.
+    assert np.abs(found - truth.points(truth.nearest(found))).max() < 0.008
 
 
 @pytest.mark.thorough

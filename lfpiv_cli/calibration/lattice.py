@@ -6,11 +6,13 @@ pitch is measured, never taken from a data sheet: lens images are projected from
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy import fft, ndimage
+from scipy.spatial import cKDTree
 from scipy.special import fdtrc
 
 from lfpiv_cli.arrays import Floats, Integers
@@ -136,6 +138,16 @@ FEWEST_LENSES = 30
 # Of the spots found, the walk must reach this share; else it started on dirt and another start is tried.
 REACHED_SHARE = 0.5
 STARTS = 20
+# Centroids beat with the pixels, by 0.05 px where lens images are small; where their rows are nearly whole pixels apart
+# that turns the lattice. Each round leaves a third of it, until no lens image moves by more than a thousandth.
+BEAT_ROUNDS = 5
+BEAT_TOLERANCE_PX = 1.0e-3
+# The light of a lens image is known in rings of this width, far below a pixel: rounding to them must move no rim. It
+# bends little within a fifth of a pixel, as pixels do not show more.
+RING_PX = 0.025
+STIFFNESS = (0.1 / RING_PX) ** 4
+# Rows of pixels that are taken at once, for their memory.
+ROWS_AT_ONCE = 128
 # Light that varies by less over a white image moves the pitch by less than its standard error, some 2e-6.
 EVEN_LIGHT = 0.01
 # Tukey's biweight: the usual constant for 95 % efficiency on a normal distribution, and enough rounds to settle.
@@ -147,8 +159,7 @@ MEDIAN_DISTANCE_TO_SIGMA = 0.8493
 # the image along each side are taken for independent.
 PARTS_PER_SIDE = 8
 # The cubic is believed when chance would do as well less than once in 1e6, and it explains this share of the residual's
-# variance and this much of it: the pixels' own error of a centroid beats slowly with the pitch and would pass for a
-# little distortion.
+# variance and this much of it: what is left of centroids' beat with the pixels would pass for a little distortion.
 CUBIC_CHANCE = 1e-6
 CUBIC_GAIN = 0.2
 CUBIC_LEAST_PX = 0.018
@@ -231,13 +242,20 @@ def fit_lattice(white: ArrayLike, dark: ArrayLike | None = None, layout: Layout 
     # Light that falls towards the corners pulls the centroids of lens images to the middle, in proportion to the image
     # height: as another pitch would.
     even = image.astype(np.float32)
-    if of_white.lens_image_width(even, fit.lattice_px) < of_white.NARROWEST_LENS_IMAGE:
-        return fit
-    coefficients = of_white.fit_vignetting(of_white.relative_transmission(even, fit.lattice_px), fit.lattice_px)
-    if coefficients is None:
-        return fit
-    passed = vignetting_surface(coefficients, image.shape)
-    return _lattice_of(image / passed, layout) if np.ptp(passed) > EVEN_LIGHT else fit
+    if of_white.lens_image_width(even, fit.lattice_px) >= of_white.NARROWEST_LENS_IMAGE:
+        coefficients = of_white.fit_vignetting(of_white.relative_transmission(even, fit.lattice_px), fit.lattice_px)
+        passed = None if coefficients is None else vignetting_surface(coefficients, image.shape)
+        if passed is not None and np.ptp(passed) > EVEN_LIGHT:
+            image = image / passed
+            fit = _lattice_of(image, layout)
+
+    centroids, middle = fit.centres_px, (np.array(image.shape[::-1]) - 1.0) / 2.0
+    for _ in range(BEAT_ROUNDS):
+        before, errors = fit, centroid_errors(image, fit)
+        fit = lattice_through(fit.indices, centroids - errors, middle, fit.lattice_px.layout)
+        if np.abs(fit.centres(fit.indices) - before.centres(before.indices)).max() < BEAT_TOLERANCE_PX:
+            break
+    return fit
 
 
 def _lattice_of(image: Floats, layout: Layout | None) -> LatticeFit:
@@ -266,6 +284,41 @@ def _lattice_of(image: Floats, layout: Layout | None) -> LatticeFit:
         )
     indices, points = without_strays(indices[best], points[best], float(np.hypot(*basis[0])))
     return lattice_through(indices, points, centre, seen)
+
+
+def centroid_errors(image: Floats, fit: LatticeFit) -> Floats:
+    """Return by how much the centroids (n, 2) of the lens images err that lie where the fit puts them, in px.
+
+    Found in an image of lens images that are all alike and round, as those of the image are in the mean. There the
+    truth is known, and what centroids miss is what pixels do to them.
+    """
+    # A pixel between two lens images has light of both.
+    near, second = (np.empty(image.shape, dtype=np.int64) for _ in range(2))
+    ways = np.array([(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if (i, j) != (0, 0)]) @ fit.lattice_px.basis
+    for top in range(0, len(image), ROWS_AT_ONCE):
+        rows = slice(top, top + ROWS_AT_ONCE)
+        row, column = np.indices(image[rows].shape)
+        place = np.stack([column, row + top], axis=-1)
+        straight = fit.lattice_px.nearest(place)
+        index = fit.lattice_px.nearest(place - fit.centres(straight) + fit.lattice_px.points(straight))
+        x, y = np.moveaxis(place - fit.centres(index), -1, 0)
+        near[rows] = np.rint(np.hypot(x, y) / RING_PX)
+        squares = ((x - step_x) ** 2 + (y - step_y) ** 2 for step_x, step_y in ways)
+        second[rows] = np.rint(np.sqrt(functools.reduce(np.minimum, squares)) / RING_PX)
+    rings = int(max(near.max(), second.max())) + 1
+    pairs = np.bincount((near * rings + second).ravel(), minlength=rings**2).reshape(rings, rings)
+    light = sum(np.bincount(each.ravel(), image.ravel(), rings) for each in (near, second))
+    bend = np.diff(np.eye(rings), 2, axis=0)
+    normal = np.diag(pairs.sum(axis=0) + pairs.sum(axis=1)) + pairs + pairs.T
+    of_ring = np.linalg.solve(normal + STIFFNESS * image.size / rings * (bend.T @ bend), light)
+    alike = of_ring[near] + of_ring[second]
+
+    centres = fit.centres(fit.indices)
+    spots = find_spots(alike, float(fit.lattice_px.pitch.mean()))
+    away, spot = cKDTree(spots).query(centres)
+    # Lens images cut by the image's edge may give no spot.
+    known = away < of_white.WALK_TOLERANCE * fit.lattice_px.pitch.min()
+    return np.where(known[:, np.newaxis], spots[np.minimum(spot, len(spots) - 1)] - centres, 0.0)
 
 
 def polynomial_terms(indices: ArrayLike, count: int = len(EXPONENTS)) -> Floats:
@@ -333,22 +386,16 @@ def lattice_through(indices: Integers, points: Floats, centre: Floats, layout: L
 
 
 def cubic_is_significant(terms: Floats, points: Floats, weights: Floats) -> bool:
-    """Tell by an F-test whether the seven further coefficients per axis do enough, and more than chance.
-
-    What a centroid's place within its pixel explains is the pixels' own error: behind a telecentric lens, where lens
-    images may be whole pixels apart, it changes so slowly over the image that a cubic follows it.
-    """
+    """Tell by an F-test whether the seven further coefficients per axis do enough, and more than chance."""
     kept = weights > 0.0
     scale = np.abs(terms).max(axis=0)
-    phase = 2.0 * np.pi * points
-    beat = np.concatenate([np.sin(phase), np.cos(phase)], axis=1)
     squares = []
     for count in (3, terms.shape[1]):
-        design = np.concatenate([(terms / scale)[:, :count], beat], axis=1)[kept]
+        design = (terms / scale)[kept, :count]
         residual = points[kept] - design @ np.linalg.lstsq(design, points[kept], rcond=None)[0]
         squares.append(float(np.sum(residual**2)))
     more = 2 * (terms.shape[1] - 3)
-    rest = 2 * (int(kept.sum()) - terms.shape[1] - beat.shape[1])
+    rest = 2 * (int(kept.sum()) - terms.shape[1])
     explained = (squares[0] - squares[1]) / (2 * int(kept.sum()))
     if squares[1] >= (1.0 - CUBIC_GAIN) * squares[0] or explained < CUBIC_LEAST_PX**2:
         return False
