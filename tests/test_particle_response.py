@@ -19,7 +19,7 @@ from lfpiv_cli.particles.least_squares import observation_of
 from lfpiv_cli.particles.noise import Noise, pixel_weights
 from lfpiv_cli.particles.pencil import MEAN_SQUARE, NODES, WEIGHTS, cubic_at, pencil_of
 from lfpiv_cli.particles.refraction import on_line_of_sight, paraxial_shift, places_by_snell
-from lfpiv_cli.particles.view import View, footprint_radius_mm, on_array_mm, raw_view, tile_side_mm
+from lfpiv_cli.particles.view import View, footprint_radius_mm, on_array_mm, raw_view, tile_side_mm, with_radius
 from lfpiv_cli.synthetic.render import Balls, render_points
 from tests.known_rays import image_of, tube_of
 from tests.particle_images import fit_moved, light_on, rows_image, rows_of
@@ -224,6 +224,24 @@ def test_particles_are_fitted_with_refracted_rays(
     # What the noise of so many rays moves a depth by; straight rays put the particles up to 0.1 mm too near.
     assert np.abs(error[:, 2]).max() < 0.003
     assert np.abs(error[:, :2]).max() < 3e-4
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("layout", ["square", "hexagonal"])
+@pytest.mark.parametrize("place", [(0.31, -0.2, 3.0), (0.33, 0.21, 0.3), (-0.2, 0.1, -0.3)])
+def test_light_bent_far_is_what_rays_make(
+    table2: Camera, water: Media, layout: Layout, place: tuple[float, float, float]
+) -> None:
+    """Behind 30 cm of water at f/3 Snell's law moves light at the rim by a third of a lens, twice a ball's width."""
+    lattice = Lattice.regular(0.1, layout, np.deg2rad(0.12), (0.013, -0.02))
+    camera = replace(table2, aperture_mm=33.0, lattice=lattice, columns=400, rows=360)
+    space, radius = behind(camera, water, 300.0, 5.0), 0.01
+    rays = render_points(camera, space, Balls([place], 1.0, 2 * radius), np.random.default_rng(1), rays=1_000_000)
+    view = with_radius(raw_view(camera, water, 3.0 * radius, space=space), radius)
+    light = twin_image(view, place)[:, 0]
+    assert light.sum() == pytest.approx(1.0, abs=1e-3)
+    # What so many rays leave is 0.005 to 0.008; with this displacement as a small change to profiles 0.03 and more.
+    assert np.abs(light - rays.ravel()).sum() < 0.0085
 
 
 @pytest.mark.thorough

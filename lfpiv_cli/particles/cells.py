@@ -1,7 +1,8 @@
-"""How much of a ball's light falls into a lens's cell where the cell is no rectangle.
+"""How much of a ball's light falls into a lens's cell where the cell is no rectangle, or rays are bent far.
 
-In a rectangle the share is a product of two of the ball's marginal distributions. Otherwise it is tabulated over the
-ball's place, as a mean over square patches of several sizes: a pixel sees the ball from everywhere in such a patch.
+In a rectangle the share is a product of two of the ball's marginal distributions, and that of bent rays is near it.
+Otherwise it is tabulated over the ball's place, as a mean over square patches of several sizes: a pixel sees the ball
+from everywhere in such a patch.
 
 Axes: image axes on the array, mm from the lens's centre.
 """
@@ -15,6 +16,7 @@ import numpy as np
 
 from lfpiv_cli.arrays import Floats, Real
 from lfpiv_cli.kernels import COUNT_NO_REFERENCES, njit
+from lfpiv_cli.names import Layout
 from lfpiv_cli.optics.camera import Lattice
 from lfpiv_cli.weights.lens_cells import neighbours
 
@@ -93,8 +95,8 @@ class CellShares(NamedTuple):
 
     Attributes
     ----------
-    table : (levels, n, n, 6), index [level, v, u] of the ball's centre, the middle entry the lens's; empty for cells
-        that are rectangles
+    table : (levels, n, n, 6), index [level, v, u] of the ball's centre, the middle entry the lens's; empty where
+        rectangles do
     side2_mm2 : (levels,) the patches' sides squared, below 0 for the smaller ball: 12 times the variance that it lacks
     step_mm : distance of entries
     radius_mm : the ball's radius on the array
@@ -106,13 +108,13 @@ class CellShares(NamedTuple):
     radius_mm: float
 
 
-# The empty table of rectangular cells.
+# The empty table, of cells that need none.
 NO_SHARES = CellShares(np.zeros((0, 0, 0, COLUMNS)), np.zeros(0), 1.0, 1.0)
 
 
-def hexagon_radius(lattice: Lattice) -> float:
-    """Return how far the corners of a hexagonal cell are from its lens."""
-    return float(lattice.pitch.max()) / np.sqrt(3.0)
+def cell_radius(lattice: Lattice) -> float:
+    """Return how far the corners of a cell are from its lens."""
+    return float(lattice.pitch.max()) / np.sqrt(2.0 if lattice.layout == "square" else 3.0)
 
 
 def smallest_ball_mm(lattice: Lattice) -> float:
@@ -121,24 +123,22 @@ def smallest_ball_mm(lattice: Lattice) -> float:
 
 
 def cell_shares(lattice: Lattice, radius_mm: float) -> CellShares:
-    """Return the shares for the cells of a hexagonal lattice and a ball whose image has about this radius."""
-    return _cell_shares(lattice.basis.tobytes(), max(radius_mm, smallest_ball_mm(lattice)))
+    """Return the shares for the cells of a lattice and a ball whose image has about this radius."""
+    return _cell_shares(lattice.basis.tobytes(), lattice.layout, max(radius_mm, smallest_ball_mm(lattice)))
 
 
 @lru_cache(maxsize=4)
-def _cell_shares(basis: bytes, radius: float) -> CellShares:
+def _cell_shares(basis: bytes, layout: Layout, radius: float) -> CellShares:
     """Return `cell_shares`, of which all images of a camera ask for the same."""
-    lattice = Lattice(np.zeros(2), np.frombuffer(basis).reshape(2, 2), "hexagonal")
+    lattice = Lattice(np.zeros(2), np.frombuffer(basis).reshape(2, 2), layout)
     step, pitch = radius / ENTRIES_PER_RADIUS, float(lattice.pitch.max())
     steps = max(int(np.ceil(np.log(pitch / (FIRST_SIDE * radius)) / np.log(NEXT_SIDE))), 0)
     sides = np.array([0.0, *(FIRST_SIDE * radius * NEXT_SIDE**n for n in range(steps)), pitch])
-    count = int(np.ceil((hexagon_radius(lattice) + 1.5 * radius + 0.75 * pitch) / step))
+    count = int(np.ceil((cell_radius(lattice) + 1.5 * radius + 0.75 * pitch) / step))
     axis = step * np.arange(-count, count + 1, dtype=np.float64)
     fine = step / FINER * np.arange(-count * FINER, count * FINER + 1, dtype=np.float64)
-    smaller, usual = (_with_derivatives(_share(lattice, fine, r), fine) for r in (SMALLER_BALL * radius, radius))
-    means = [_mean_over(axis, fine, side) for side in sides]
-    levels = [(means[0], smaller), *((mean, usual) for mean in means)]
-    table = np.stack([np.stack([mean @ values @ mean.T for values in ball], axis=-1) for mean, ball in levels])
+    smaller, usual = (_sums(_with_derivatives(_share(lattice, fine, r), fine)) for r in (SMALLER_BALL * radius, radius))
+    table = np.stack([_mean_over(smaller, axis, fine, 0.0), *(_mean_over(usual, axis, fine, side) for side in sides)])
     lacking = 12.0 * BALL_VARIANCE * (1.0 - SMALLER_BALL**2) * radius**2
     return CellShares(table, np.array([-lacking, *sides**2]), step, radius)
 
@@ -151,15 +151,30 @@ def _with_derivatives(share: Floats, axis_mm: Floats) -> list[Floats]:
     return [share, by_u, by_v, by_uu, by_uv, np.gradient(by_v, step, axis=0)]
 
 
-def _mean_over(axis: Floats, fine: Floats, side: float) -> Floats:
-    """Return the matrix (n, m) that takes values on the fine axis to their means over `side` around the coarse one."""
-    if side == 0.0:
-        return np.asarray(np.abs(axis[:, np.newaxis] - fine) < 0.5 * (fine[1] - fine[0]), dtype=np.float64)
-    # The part of each fine point's interval that lies within the patch.
-    half = 0.5 * (fine[1] - fine[0])
-    low = np.maximum(axis[:, np.newaxis] - 0.5 * side, fine - half)
-    high = np.minimum(axis[:, np.newaxis] + 0.5 * side, fine + half)
-    return np.asarray(np.maximum(high - low, 0.0) / side)
+def _sums(values: list[Floats]) -> Floats:
+    """Return the sums (m + 1, m + 1, columns) of values (m, m) over the points before each along both axes."""
+    return np.pad(np.stack(values, axis=-1), ((1, 0), (1, 0), (0, 0))).cumsum(axis=0).cumsum(axis=1)
+
+
+def _mean_over(sums: Floats, axis: Floats, fine: Floats, side: float) -> Floats:
+    """Return the means (n, n, columns) over squares of that side around the points of an axis, from a fine one's sums.
+
+    Each fine point has the interval around it; the least square is one such interval.
+    """
+    step = fine[1] - fine[0]
+    side = max(side, step)
+    for _ in range(2):
+        ends = (np.clip((axis + half - fine[0]) / step + 0.5, 0.0, fine.size) for half in (-0.5 * side, 0.5 * side))
+        below, above = (_between(sums, at) for at in ends)
+        sums = ((above - below) * (step / side)).swapaxes(0, 1)
+    return sums
+
+
+def _between(sums: Floats, at: Floats) -> Floats:
+    """Return values between those of the first axis, by lines."""
+    first = np.minimum(at.astype(np.int64), len(sums) - 2)
+    share = (at - first)[:, np.newaxis, np.newaxis]
+    return sums[first] * (1.0 - share) + sums[first + 1] * share
 
 
 def _share(lattice: Lattice, axis_mm: Floats, radius_mm: float) -> Floats:
@@ -170,7 +185,9 @@ def _share(lattice: Lattice, axis_mm: Floats, radius_mm: float) -> Floats:
     eta, weight = np.polynomial.legendre.leggauss(CHORDS)
     light = 0.75 * weight * (1.0 - eta**2)
     half = radius_mm * np.sqrt(1.0 - eta**2)
-    height = axis_mm[:, np.newaxis] + radius_mm * eta
+    # Further away the ball is outside.
+    near = np.abs(axis_mm) < cell_radius(lattice) + radius_mm
+    height = axis_mm[near, np.newaxis] + radius_mm * eta
     low, high = np.full(height.shape, -np.inf), np.full(height.shape, np.inf)
     for a, b in neighbours(lattice):
         rest = 0.5 * (a * a + b * b) - b * height
@@ -181,13 +198,13 @@ def _share(lattice: Lattice, axis_mm: Floats, radius_mm: float) -> Floats:
         else:
             low = np.maximum(low, rest / a)
     high = np.maximum(high, low)
-    u = axis_mm[:, np.newaxis]
+    u = axis_mm[near, np.newaxis]
     # The cell is the same turned by half a turn, and so is the axis.
     rows = [
         (_below((b - u) / half) - _below((a - u) / half)) @ light
-        for a, b in zip(low[: axis_mm.size // 2 + 1], high[: axis_mm.size // 2 + 1], strict=True)
+        for a, b in zip(low[: u.size // 2 + 1], high[: u.size // 2 + 1], strict=True)
     ]
-    return np.stack(rows + [row[::-1] for row in rows[-2::-1]])
+    return np.pad(np.stack(rows + [row[::-1] for row in rows[-2::-1]]), (axis_mm.size - u.size) // 2)
 
 
 def _below(t: Floats) -> Floats:

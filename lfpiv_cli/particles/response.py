@@ -237,13 +237,18 @@ def seen_moves(view: View, bend: Bend, axis: int) -> tuple[float, float, float, 
     return 1.0 if axis == 0 else 0.0, 1.0 if axis == 1 else 0.0, deeper, deeper
 
 
+# Blur by less than this share of the ball's radius is not seen.
+STEEP = 0.3
+
+
 @njit(cache=True, **COUNT_NO_REFERENCES)
 def join_cell(
     view: View, projection: Projection, bend: Bend, lens: tuple[float, float], pixels: NDArray[np.int32], values: Floats
 ) -> int:
-    """Write the entries of one lens whose cell is no rectangle; return their number."""
+    """Write the entries of one lens whose cell's shares are tabulated; return their number."""
     camera = view.camera
     count = 0
+    bent = camera.image_distance_mm * largest_displacement(bend, camera.aperture_radius_mm)
     # Behind planes, where alone these cells are, the same along both axes but for places and the distortion.
     x, alpha, beta, slope, at_x, stretch_x, scale, whole_lever, _, radius, growth, _, _ = projection.x
     y, at_y, stretch_y = projection.y.x, projection.y.at, projection.y.stretch
@@ -253,14 +258,18 @@ def join_cell(
     gain_x, gain_y = stretch_x * alpha, stretch_y * alpha
     shift_x = (1.0 - camera.bend) * s_x - lever * scale * beta * x
     shift_y = (1.0 - camera.bend) * s_y - lever * scale * beta * y
-    column, columns = lit_pixels(view, gain_x, off_x, view.half_x_mm + radius, scale, shift_x, camera.columns)
-    row, rows = lit_pixels(view, gain_y, off_y, view.half_y_mm + radius, scale, shift_y, camera.rows)
+    reach = view.corner_mm + radius
+    column, columns = lit_pixels(view, gain_x, off_x, reach + stretch_x * bent, scale, shift_x, camera.columns)
+    row, rows = lit_pixels(view, gain_y, off_y, reach + stretch_y * bent, scale, shift_y, camera.rows)
     width = abs(camera.pixel_mm / scale)
     norm = width * width / (np.pi * camera.aperture_radius_mm**2)
     inside = max(camera.aperture_radius_mm - 0.71 * width, 0.0) ** 2
     outside = (camera.aperture_radius_mm + 0.71 * width) ** 2
+    # Across a patch, what a cubic moves rays by changes by up to thrice its share of the radius.
+    steep = 3.0 * bent * width / camera.aperture_radius_mm
+    is_steep = steep > STEEP * radius
     # No ray of a patch further from the lens than this meets its cell.
-    furthest = (view.half_x_mm + radius + 0.71 * width * max(abs(gain_x), abs(gain_y))) ** 2
+    furthest = (reach + 0.71 * (width * max(abs(gain_x), abs(gain_y)) + steep)) ** 2
     move_x, move_y = (lever * alpha - 1.0) * beta * stretch_x, (lever * alpha - 1.0) * beta * stretch_y
     # The patch on the array. It blurs the ball; so does more of a radius, and the variance of either is what counts.
     stretch = 0.5 * (stretch_x + stretch_y)
@@ -285,6 +294,18 @@ def join_cell(
             v = off_y + gain_y * patch_y + stretch_y * camera.image_distance_mm * slope_y
             if u * u + v * v >= furthest:
                 continue
+            if is_steep:
+                next_x, next_y = (
+                    displaced(bend, patch_x + width, patch_y)[0],
+                    displaced(bend, patch_x, patch_y + width)[1],
+                )
+                side_x = gain_x * width + stretch_x * camera.image_distance_mm * (next_x - slope_x)
+                side_y = gain_y * width + stretch_y * camera.image_distance_mm * (next_y - slope_y)
+                lit = 0.5 * (side_x * side_x + side_y * side_y) + square - side * side
+                level, blend = level_at(lit, view.cell_side2_mm2)
+                wider = 0.5 / 12.0 * min(lit - view.cell_side2_mm2[0], 0.0)
+                low, high = view.cell_table[level], view.cell_table[level + 1]
+                half_x, half_y = 0.5 * side_x, 0.5 * side_y
             part, by_u, by_v, by_uu, by_uv, by_vv = share_at(u, v, low, high, blend, view.cell_step_mm)
             part += wider * (by_uu + by_vv)
             u_z = stretch_x * slope * (patch_x - x) * (1.0 - alpha * lever)

@@ -28,8 +28,8 @@ from lfpiv_cli.optics.curved_space import CurvedSpace
 from lfpiv_cli.optics.line_responses import NO_LINES, LineResponses, line_responses, of_balls, on_pixels
 from lfpiv_cli.optics.media import Layers, Media
 from lfpiv_cli.optics.surfaces import Faces
-from lfpiv_cli.optics.tracing import ObjectSpace
-from lfpiv_cli.particles.cells import NO_SHARES, cell_shares, hexagon_radius, smallest_ball_mm
+from lfpiv_cli.optics.tracing import ObjectSpace, refraction_error_mm
+from lfpiv_cli.particles.cells import NO_SHARES, cell_radius, cell_shares, smallest_ball_mm
 from lfpiv_cli.particles.pencil import lines_of
 from lfpiv_cli.threads import in_threads
 from lfpiv_cli.weights.scene import NO_FACES
@@ -38,7 +38,9 @@ from lfpiv_cli.weights.scene import NO_FACES
 SMALLEST_RADIUS_LENSES = 1e-3
 # Depths between two others at which footprints are asked for; behind curved faces also places along each image axis.
 SAMPLED_DEPTHS, SAMPLED_PLACES = 101, 11
-# Tables of hexagonal cells serve balls that differ from theirs by this factor: only their blur's variance is changed.
+# Rays that Snell's law moves by more than this share of the pitch at the rim are no small change to profiles.
+BENT_FAR = 0.05
+# Tables of cells' shares serve balls that differ from theirs by this factor: only their blur's variance is changed.
 SAME_TABLE = 1.6
 
 
@@ -53,8 +55,10 @@ class View(NamedTuple):
     layers : from the lens to the focal point, of plane faces that bend rays by Snell's law; one where rays are straight
     faces : curved ones; none where all are plane
     half_x_mm, half_y_mm : half the rectangle that holds a lens's cell
+    corner_mm : how far a cell's corners are from its lens
     cell_reach : how far a cell reaches at most from its lens, in steps of the lattice
-    cell_table, cell_side2_mm2, cell_step_mm, cell_ball_mm : of cells that are no rectangles, see `cells.CellShares`
+    cell_table, cell_side2_mm2, cell_step_mm, cell_ball_mm : of cells that are no rectangles, or rays bent far, see
+        `cells.CellShares`
     particle_radius_mm : of the balls
     centres_mm : (nj, ni, 2) lens centres on the array; entry [j, i] is lens (first_i + i, first_j + j)
     inverse_basis : (2, 2) of the plain lattice, to find lenses
@@ -70,6 +74,7 @@ class View(NamedTuple):
     faces: Faces
     half_x_mm: float
     half_y_mm: float
+    corner_mm: float
     cell_reach: float
     cell_table: Floats
     cell_side2_mm2: Floats
@@ -178,12 +183,10 @@ def raw_view(
     lattice = camera.lattice
     scale = camera.scale(media)
     radius = max(particle_radius_mm, SMALLEST_RADIUS_LENSES * scale.lens_mm)
-    if lattice.layout == "square":
-        half_x, half_y = 0.5 * lattice.pitch
-        cell_reach, shares = 0.5, NO_SHARES
-    else:
-        half_x = half_y = hexagon_radius(lattice)
-        cell_reach = 2.0 / 3.0
+    half_x, half_y = 0.5 * lattice.pitch if lattice.layout == "square" else 2 * (cell_radius(lattice),)
+    bent_mm = 0.0 if plane.straight else refraction_error_mm(camera, media, plane.window, np.zeros(1))
+    shares = NO_SHARES
+    if lattice.layout != "square" or (light is None and bent_mm > BENT_FAR * lattice.pitch.min()):
         shares = cell_shares(lattice, radius * camera.image_distance_mm / camera.focus_distance_mm)
     view = View(
         camera=camera.for_kernels(),
@@ -193,7 +196,8 @@ def raw_view(
         faces=space.for_kernels(camera) if isinstance(space, CurvedSpace) else NO_FACES,
         half_x_mm=float(half_x),
         half_y_mm=float(half_y),
-        cell_reach=cell_reach,
+        corner_mm=cell_radius(lattice),
+        cell_reach=0.5 if lattice.layout == "square" else 2.0 / 3.0,
         cell_table=shares.table,
         cell_side2_mm2=shares.side2_mm2,
         cell_step_mm=shares.step_mm,
@@ -243,7 +247,8 @@ def with_radius(view: View, particle_radius_mm: float) -> View:
     if view.cell_table.shape[0] == 0:
         return view
     basis = np.asarray(np.linalg.inv(view.inverse_basis), np.float64)
-    lattice = Lattice(view.camera.origin_mm, basis, "hexagonal")
+    across = abs(basis[0] @ basis[1]) > 0.25 * np.sum(basis[0] ** 2)
+    lattice = Lattice(view.camera.origin_mm, basis, "hexagonal" if across else "square")
     radius = view.particle_radius_mm * view.camera.image_distance_mm / view.camera.focus_distance_mm
     smallest = smallest_ball_mm(lattice)
     if max(radius, smallest) / SAME_TABLE <= view.cell_ball_mm <= max(radius, smallest) * SAME_TABLE:
