@@ -12,7 +12,7 @@ import pytest
 from lfpiv_cli.arrays import Floats
 from lfpiv_cli.calibration import model
 from lfpiv_cli.calibration.board_pose import BoardGeometry, BoardPose, pose_of_dots
-from lfpiv_cli.calibration.lattice import LatticeFit, fit_lattice, without_strays
+from lfpiv_cli.calibration.lattice import LatticeFit, fit_lattice, shadowed, without_strays
 from lfpiv_cli.calibration.model import Calibration, Channel, DataSheet, Photographs, Rig, calibrate, with_mid_plane
 from lfpiv_cli.calibration.white import index_spots
 from lfpiv_cli.errors import InputError
@@ -298,6 +298,21 @@ def test_lattices_are_found_stopped_down_or_at_working_aperture(
     turn = np.rad2deg(fit.lattice_px.rotation_rad) - angle_deg
     beyond = layout == "hexagonal" and abs(angle_deg) > 30.0
     assert turn == pytest.approx(-60.0 * np.sign(angle_deg) if beyond else 0.0, abs=0.03)
+
+
+def test_pixels_behind_specks_are_known_and_noise_is_none(layout: str, rng: np.random.Generator) -> None:
+    lattice = tilted(layout)
+    row, column = np.indices(IMAGE_SHAPE)
+    passing = np.ones(IMAGE_SHAPE)
+    for i, j in ((-3, 2), (1, -4), (5, 1)):
+        x, y = lattice.points((i, j))
+        passing *= 1.0 - 0.3 * np.exp(-((column - x) ** 2 + (row - y) ** 2) / (2.0 * 1.5**2))
+    light = rng.poisson((discs(lens_centres(lattice), 5.5) - 100.0) * passing) + rng.normal(0.0, 40.0, IMAGE_SHAPE)
+    found = shadowed(light, fit_lattice(light, layout=layout), np.ones(1))
+    # Where a tenth is missing or more, and hardly where less than a hundredth is.
+    assert found[passing < 0.9].all()
+    assert found[passing > 0.99].sum() < 0.2 * found.sum()
+    assert not shadowed(light / passing, fit_lattice(light, layout=layout), np.ones(1)).any()
 
 
 def test_dirty_photographs(layout: str, rng: np.random.Generator) -> None:

@@ -225,6 +225,18 @@ def test_rounding_hides_the_level_between_lens_images(by_commands: Path) -> None
 
 
 @pytest.mark.thorough
+def test_pixels_behind_specks_take_no_part(by_commands: Path) -> None:
+    content = lf.open_weights(by_commands / "weights.h5")
+    shadowed = np.zeros((448, 600), np.bool_)
+    shadowed[200:206, 300:308] = True
+    calibration = replace(content.weights.calibration, shadowed=shadowed)
+    content = replace(content, weights=replace(content.weights, calibration=calibration))
+    bench = bench_of(content, carried_config(content.provenance, "the weights"), None, None)
+    np.testing.assert_array_equal(bench.lasting, shadowed)
+    assert bench.excluded[203, 304]
+
+
+@pytest.mark.thorough
 def test_particles_and_tracks_are_those_of_the_commands(by_commands: Path) -> None:
     weights = lf.open_weights(by_commands / "weights.h5")
     found = [

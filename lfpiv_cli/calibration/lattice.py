@@ -15,13 +15,14 @@ from scipy import fft, ndimage
 from scipy.spatial import cKDTree
 from scipy.special import fdtrc
 
-from lfpiv_cli.arrays import Floats, Integers
+from lfpiv_cli.arrays import Flags, Floats, Integers, Singles
 from lfpiv_cli.calibration import white as of_white
 from lfpiv_cli.calibration.white import find_spots, vignetting_surface
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.names import Layout
-from lfpiv_cli.neighbourhoods import largest_around
+from lfpiv_cli.neighbourhoods import largest_around, with_neighbours
 from lfpiv_cli.optics.camera import Lattice
+from lfpiv_cli.robust import MAD_TO_SIGMA
 
 # The pitch and direction of a lens lattice, from the spectrum of a white image: a guess that needs no data sheet.
 # Frequencies are (column, row), in cycles per pixel.
@@ -146,6 +147,10 @@ BEAT_TOLERANCE_PX = 1.0e-3
 # bends little within a fifth of a pixel, as pixels do not show more.
 RING_PX = 0.025
 STIFFNESS = (0.1 / RING_PX) ** 4
+# A speck's shadow is seen in the middles of lens images, above this share of their light, as a mean over so many pixels
+# (standard deviation): it lacks this share and is no chance, of some millions. It reaches further than it is seen.
+SHADOW_INNER, SHADOW_PX = 0.85, 1.0
+SHADOW_LEAST, SHADOW_SIGMAS, MOST_SHADOWED = 0.05, 6.0, 0.05
 # Rows of pixels that are taken at once, for their memory.
 ROWS_AT_ONCE = 128
 # Light that varies by less over a white image moves the pitch by less than its standard error, some 2e-6.
@@ -292,6 +297,16 @@ def centroid_errors(image: Floats, fit: LatticeFit) -> Floats:
     Found in an image of lens images that are all alike and round, as those of the image are in the mean. There the
     truth is known, and what centroids miss is what pixels do to them.
     """
+    centres = fit.centres(fit.indices)
+    spots = find_spots(of_alike(image, fit), float(fit.lattice_px.pitch.mean()))
+    away, spot = cKDTree(spots).query(centres)
+    # Lens images cut by the image's edge may give no spot.
+    known = away < of_white.WALK_TOLERANCE * fit.lattice_px.pitch.min()
+    return np.where(known[:, np.newaxis], spots[np.minimum(spot, len(spots) - 1)] - centres, 0.0)
+
+
+def of_alike(image: Floats, fit: LatticeFit) -> Floats:
+    """Return the image (rows, columns) of lens images that are all alike and round: the mean of those in the image."""
     # A pixel between two lens images has light of both.
     near, second = (np.empty(image.shape, dtype=np.int64) for _ in range(2))
     ways = np.array([(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if (i, j) != (0, 0)]) @ fit.lattice_px.basis
@@ -311,14 +326,27 @@ def centroid_errors(image: Floats, fit: LatticeFit) -> Floats:
     bend = np.diff(np.eye(rings), 2, axis=0)
     normal = np.diag(pairs.sum(axis=0) + pairs.sum(axis=1)) + pairs + pairs.T
     of_ring = np.linalg.solve(normal + STIFFNESS * image.size / rings * (bend.T @ bend), light)
-    alike = of_ring[near] + of_ring[second]
+    return np.asarray(of_ring[near] + of_ring[second])
 
-    centres = fit.centres(fit.indices)
-    spots = find_spots(alike, float(fit.lattice_px.pitch.mean()))
-    away, spot = cKDTree(spots).query(centres)
-    # Lens images cut by the image's edge may give no spot.
-    known = away < of_white.WALK_TOLERANCE * fit.lattice_px.pitch.min()
-    return np.where(known[:, np.newaxis], spots[np.minimum(spot, len(spots) - 1)] - centres, 0.0)
+
+def shadowed(white: Floats | Singles, fit: LatticeFit, passed: Floats | Singles) -> Flags:
+    """Return the pixels (rows, columns) that lie in the shadow of a speck: darker than other lens images show them.
+
+    Parameters
+    ----------
+    white : (rows, columns) raw, less the dark image
+    passed : (rows, columns) what of the light varies slowly over the sensor
+    """
+    even = np.asarray(white / passed, np.float64)
+    alike = of_alike(even, fit)
+    inner = alike > SHADOW_INNER * np.percentile(alike, of_white.FULL_PERCENTILE)
+    missing = np.where(inner, 1.0 - even / np.where(inner, alike, 1.0), 0.0)
+    around = ndimage.gaussian_filter(inner.astype(np.float64), SHADOW_PX)
+    missing = ndimage.gaussian_filter(missing, SHADOW_PX) / np.where(inner, around, 1.0)
+    noise = MAD_TO_SIGMA * float(np.median(np.abs(missing[inner])))
+    dark = inner & (missing > max(SHADOW_SIGMAS * noise, SHADOW_LEAST))
+    # Lens images that differ otherwise, as where the aperture is cut, are no shadows.
+    return with_neighbours(dark & (np.count_nonzero(dark) <= MOST_SHADOWED * np.count_nonzero(inner)))
 
 
 def polynomial_terms(indices: ArrayLike, count: int = len(EXPONENTS)) -> Floats:

@@ -13,12 +13,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 from threadpoolctl import threadpool_limits
 
-from lfpiv_cli.arrays import Floats, Singles
+from lfpiv_cli.arrays import Flags, Floats, Singles
 from lfpiv_cli.calibration import white as of_white
 from lfpiv_cli.calibration.board import PictureFrame, locate_board
 from lfpiv_cli.calibration.board_pose import BoardGeometry, BoardPose
 from lfpiv_cli.calibration.dlfc import RayFit, fit_rays
-from lfpiv_cli.calibration.lattice import LatticeFit, fit_lattice
+from lfpiv_cli.calibration.lattice import LatticeFit, fit_lattice, shadowed
 from lfpiv_cli.calibration.light_checks import check_residual
 from lfpiv_cli.calibration.rectification import Rectification
 from lfpiv_cli.calibration.sheet import check_pitch, image_distance_mm, sheet_fit
@@ -85,6 +85,7 @@ class Calibration(Result):
     ray_fit : polynomials of rays from boards at several depths, in the rectified frame, or None
     scene : where the faces before the fluid lie, from where the config has them, or None
     white : (rows, columns) float32, raw uniform light over that of a full lens image, where the transmission is known
+    shadowed : (rows, columns) raw pixels in the shadow of a speck, where the transmission is known
     provenance : the record of how it was made
     """
 
@@ -100,6 +101,7 @@ class Calibration(Result):
     mid_plane_given: bool = False
     scene: ScenePose | None = None
     white: Singles | None = None
+    shadowed: Flags | None = None
     provenance: dict[str, Any] = field(default_factory=dict)
 
     @property
@@ -289,13 +291,20 @@ def lattice_calibration(pictures: Photographs, shape: tuple[int, int], sheet: Da
     rectification = Rectification(fit, shape)
     raw = pictures.less_dark(whites[order[-1]])
     image, lattice_px = rectification.apply(raw), rectification.lattice_px
-    transmission, white = None, None
+    transmission, white, shadows = None, None, None
     if of_white.lens_image_width(image, lattice_px) >= NARROWEST_LENS_IMAGE:
         transmission = of_white.relative_transmission(image, lattice_px)
         white = np.maximum(raw / np.percentile(raw, of_white.FULL_PERCENTILE), 0.0).astype(np.float32)
+        slow = of_white.fit_vignetting(transmission, lattice_px)
+        shadows = shadowed(raw, fit, np.ones(1) if slow is None else of_white.vignetting_surface(slow, shape))
     distance, sigma = (None, None) if camera is None else image_distance_mm(fit, camera) or (None, None)
     return Calibration(
-        rectification, transmission, image_distance_mm=distance, image_distance_sigma_mm=sigma, white=white
+        rectification,
+        transmission,
+        image_distance_mm=distance,
+        image_distance_sigma_mm=sigma,
+        white=white,
+        shadowed=shadows,
     )
 
 

@@ -1,9 +1,9 @@
 """The calibration file: all that `calibration.model.Calibration` holds, as HDF5.
 
 Layout, version 1: `image_shape` (rows, columns), `lattice` (centres and model of the lens images, pixels as (column,
-row)), `transmission` and `white` (rows, columns), `board` (pose, mm and degrees), `dlfc` (rays fitted to boards at
-several depths), `scene` (where the faces lie), and the channel's mid plane (mm). A weights file holds the same as a
-group.
+row)), `transmission`, `white` and `shadowed` (rows, columns), `board` (pose, mm and degrees), `dlfc` (rays fitted to
+boards at several depths), `scene` (where the faces lie), and the channel's mid plane (mm). A weights file holds the
+same as a group.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ from lfpiv_cli.optics.tracing import LARGEST_DEGREE, VARIABLES, PolynomialRays
 FORMAT = "lfpiv-calibration"
 VERSION = 1
 # Of the arrays whose names do not say them.
-UNITS = {"image_shape": "pixel", "transmission": "1", "white": "1", "indices": "1", "exponents": "1"}
+UNITS = {"image_shape": "pixel", "transmission": "1", "white": "1", "shadowed": "1", "indices": "1", "exponents": "1"}
 # Of the whole sensor; None where they were not measured.
-PICTURES = ("transmission", "white")
+PICTURES = ("transmission", "white", "shadowed")
 
 Shape = tuple[int | None, ...]
 
@@ -104,6 +104,7 @@ def tree_of(calibration: Calibration) -> dict[str, Any]:
         "lattice": fit | {"cubic_used": int(calibration.fit.cubic_used)},
         "transmission": calibration.transmission,
         "white": calibration.white,
+        "shadowed": None if calibration.shadowed is None else calibration.shadowed.astype(np.uint8),
         **{name: None if part is None else asdict(part) for name, part in parts.items()},
         "mid_plane_given": 1 if calibration.mid_plane_given else None,
         **{name: getattr(calibration, name) for name in CARRIED},
@@ -126,7 +127,7 @@ def calibration_of(tree: Mapping[str, Any]) -> Calibration:
                 _checked({name: picture}, {name: (rows, columns)})
                 if not np.isfinite(picture).all():
                     raise ValueError(f"a {name} is not a finite number")
-        passed, white = pictures
+        passed, white, shadows = pictures
         lattice = Lattice(fit.pop("origin_px"), fit.pop("basis_px"), fit.pop("layout"))
         fit["cubic_used"] = bool(fit["cubic_used"])
         ray_fit, scene = None, None
@@ -152,6 +153,7 @@ def calibration_of(tree: Mapping[str, Any]) -> Calibration:
             mid_plane_given=bool(tree.get("mid_plane_given")),
             scene=scene,
             white=white,
+            shadowed=None if shadows is None else shadows.astype(np.bool_),
             **carried,
         )
     except (KeyError, TypeError, ValueError, AttributeError) as error:

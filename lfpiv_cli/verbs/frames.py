@@ -232,7 +232,7 @@ class Bench:
     Attributes
     ----------
     dark : dark image (rows, columns) or None
-    lasting : raw pixels that are never usable: defects of the dark image, and where the mask is black
+    lasting : raw pixels that are never usable: defects of the dark image, specks' shadows, and where the mask is black
     excluded : pixels in the weights' frame that never take part: off the sensor, or touched by `lasting`
     sums : of the weights without `excluded`; None where weights are made for each image
     lens_images : what the light of frames is held against
@@ -301,6 +301,8 @@ def bench_of(
     lasting = np.zeros(weights.image_shape, np.bool_) if dark is None else of_images.defects(dark)
     if mask is not None:
         lasting |= mask == 0.0
+    if weights.calibration is not None and weights.calibration.shadowed is not None:
+        lasting |= weights.calibration.shadowed
     if lasting.all():
         raise InputError("mask and dark image leave out all pixels; a mask is black only where nothing is believed")
     excluded = of_images.touched(lasting, weights.prepare) if lasting.any() else np.zeros(weights.image_shape, np.bool_)
