@@ -324,8 +324,9 @@ def of_alike(image: Floats, fit: LatticeFit) -> Floats:
     pairs = np.bincount((near * rings + second).ravel(), minlength=rings**2).reshape(rings, rings)
     light = sum(np.bincount(each.ravel(), image.ravel(), rings) for each in (near, second))
     bend = np.diff(np.eye(rings), 2, axis=0)
+    stiff = np.diff(np.pad(bend, ((2, 2), (0, 0))), 2, axis=0)
     normal = np.diag(pairs.sum(axis=0) + pairs.sum(axis=1)) + pairs + pairs.T
-    of_ring = np.linalg.solve(normal + STIFFNESS * image.size / rings * (bend.T @ bend), light)
+    of_ring = np.linalg.solve(normal + STIFFNESS * image.size / rings * stiff, light)
     return np.asarray(of_ring[near] + of_ring[second])
 
 
