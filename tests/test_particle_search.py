@@ -62,6 +62,14 @@ def begun(task: Task, tracers: Floats) -> State:
 
 
 @pytest.mark.thorough
+def test_read_noise_is_that_of_pixels_that_are_read(task: Task) -> None:
+    counts, usable = np.rint(np.random.default_rng(6).normal(0.0, 2.0, task.image.size)), np.ones(task.image.size, bool)
+    # The gap of a pixel that is left out is filled from those around it.
+    counts[7], usable[7] = -0.37, False
+    assert replace(task, image=counts, usable=usable).read_counts == pytest.approx(2.0, rel=0.03)
+
+
+@pytest.mark.thorough
 def test_sweeps_end_where_those_over_all_end(task: Task, tracers: Floats) -> None:
     every, some = begun(task, tracers), begun(task, tracers)
     for _ in range(6):

@@ -191,8 +191,8 @@ class Task:
 
     @cached_property
     def read_counts(self) -> float:
-        """The image's read noise, which every step asks for."""
-        return read_noise(self.image)
+        """The image's read noise, which every step asks for: of whole counts, which what fills gaps is not."""
+        return read_noise(self.image[self.usable])
 
 
 class Fits(NamedTuple):
