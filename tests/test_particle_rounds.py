@@ -333,3 +333,18 @@ def test_small_tracers_of_which_a_lens_or_two_are_lit_are_all_found(table2: Came
     image = light + np.sqrt(36.0 + 2.0 * light) * rng.normal(size=light.size)
     particles = find_particles(task_for(image, camera, water, grid, 0.01)).position_mm
     np.testing.assert_array_equal(is_found(particles, true), True)
+
+
+@pytest.mark.thorough
+def test_depths_behind_few_pixels_for_each_lens_are_covered(table2: Camera, water: Media) -> None:
+    camera, over_sigma = replace(table2, pixel_mm=0.0125, columns=120, rows=120), []
+    grid, space = grid_of((5, 5, 40), 3.2, (0.1, 0.1, 0.1)), ObjectSpace(water, None, "paraxial")
+    for seed in range(16):
+        rng = np.random.default_rng(seed)
+        true = rng.uniform((-0.1, -0.1, 2.7), (0.1, 0.1, 3.7), (1, 3))
+        image = render_points(camera, space, Balls(true, 2e6, 0.02), rng, rays=400_000).ravel()
+        found = find_particles(task_for(np.rint(with_noise(image, rng)), camera, water, grid, 0.01))
+        over_sigma.append((found.position_mm[0] - true[0])[2] / np.sqrt(found.covariance_mm2[0, 2, 2]))
+    # Of 16 all but two: errors that knew of noise alone covered a fourth of them, and the worst was eleven of them off.
+    assert np.mean(np.abs(over_sigma) < 1.96) >= 14 / 16
+    assert np.median(np.abs(over_sigma)) > 0.3

@@ -31,7 +31,7 @@ from lfpiv_cli.particles.noise import (
     pixel_weights,
     read_noise,
 )
-from lfpiv_cli.particles.view import View, footprint_radius_mm, lens_pixels, on_array_mm, with_diffusion
+from lfpiv_cli.particles.view import View, by_waves, footprint_radius_mm, lens_pixels, on_array_mm, with_diffusion
 from lfpiv_cli.reconstruction.solvers import Normalisers
 from lfpiv_cli.robust import MAD_TO_SIGMA
 from lfpiv_cli.weights.model import Weights
@@ -108,6 +108,10 @@ LEAST_SEEN = 0.5
 # (Table 2: 0.04, 0.25 and 0.3 mm).
 # Two particles this close, laterally and in depth, are in one place.
 SAME_LENSES, SAME_DEPTHS = 0.4, 0.25 / 1.064
+# Pixels at the rim of lens images are lit in part, which the model of light by rays knows to first order: where a lens
+# has so many pixels, depths of small tracers are wrong by this share at most, and by more where it has fewer. Of 64,
+# 144 and 400 pixels they are too small by 0.002, 0.0008 and 0.0002 in the mean over places, if a tenth of a lens wide.
+RIM_SHARE, RIM_PIXELS, RIM_POWER = 4.0e-4, 400.0, 1.25
 # Particles this far in front of and behind the volume are kept, as they light it, in front at most this share of the
 # way to the lens: within 0.3 depths alone, tracers from further away end there, and with 30 % of all outside the
 # velocity in depth was 10 % too small.
@@ -455,6 +459,8 @@ def result(task: Task, state: State) -> Particles:
     covariance = grown(task.view, particles, covariance, share, correlation.share)
     covariance, ambiguous = with_other_places(observation, particles, covariance, chi2, correlation.share)
     covariance = covariance + of_two(task.view, particles, seen > LEAST_SEEN)
+    if not by_waves(task.view):
+        covariance[:, 2, 2] += (RIM_SHARE * (RIM_PIXELS / lens_pixels(task.view)) ** RIM_POWER * particles[:, 2]) ** 2
     beyond = np.isin(particles[:, 2], task.depths_mm)
     covariance[beyond, 2, 2] += (MARGIN_DEPTHS * task.view.scale.depth_mm) ** 2
     to_world = task.camera.to_image_axes(np.eye(3))
