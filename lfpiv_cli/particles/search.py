@@ -108,10 +108,11 @@ LEAST_SEEN = 0.5
 # (Table 2: 0.04, 0.25 and 0.3 mm).
 # Two particles this close, laterally and in depth, are in one place.
 SAME_LENSES, SAME_DEPTHS = 0.4, 0.25 / 1.064
-# Pixels at the rim of lens images are lit in part, which the model of light by rays knows to first order: where a lens
-# has so many pixels, depths of small tracers are wrong by this share at most, and by more where it has fewer. Of 64,
-# 144 and 400 pixels they are too small by 0.002, 0.0008 and 0.0002 in the mean over places, if a tenth of a lens wide.
-RIM_SHARE, RIM_PIXELS, RIM_POWER = 4.0e-4, 400.0, 1.25
+# Pixels at the rim of lens images are lit in part, which the model of light by rays knows to first order. Of tracers of
+# up to this radius, in lenses, depths are wrong by this share at most where a lens has so many pixels, and by less the
+# larger tracers are and by its square the more pixels there are: of a tenth of a lens and 64, 144 and 400 pixels depths
+# are too small by 0.002, 0.0008 and 0.0002 in the mean over places, of 0.3 by 0.0008, 0.0002 and 0.00005.
+RIM_SHARE, RIM_PIXELS, RIM_LENSES = 4.0e-3, 64.0, 0.1
 # Particles this far in front of and behind the volume are kept, as they light it, in front at most this share of the
 # way to the lens: within 0.3 depths alone, tracers from further away end there, and with 30 % of all outside the
 # velocity in depth was 10 % too small.
@@ -437,6 +438,12 @@ def missing_around(view: View, particles: Floats, chi2: Floats, known: NDArray[n
     return np.maximum(missing_light(chi2, light, known, pixels), missing_light(together, light, known, pixels * number))
 
 
+def rim_error(view: View) -> float:
+    """Return by what share of their depths particles are wrong where lens images are few pixels wide, at most."""
+    larger = max(view.particle_radius_mm / (RIM_LENSES * view.scale.lens_mm), 1.0)
+    return RIM_SHARE / larger * (RIM_PIXELS / lens_pixels(view)) ** 2
+
+
 def result(task: Task, state: State) -> Particles:
     """Return the particles in world axes, brightest first."""
     shape = task.prepared.shape
@@ -460,7 +467,7 @@ def result(task: Task, state: State) -> Particles:
     covariance, ambiguous = with_other_places(observation, particles, covariance, chi2, correlation.share)
     covariance = covariance + of_two(task.view, particles, seen > LEAST_SEEN)
     if not by_waves(task.view):
-        covariance[:, 2, 2] += (RIM_SHARE * (RIM_PIXELS / lens_pixels(task.view)) ** RIM_POWER * particles[:, 2]) ** 2
+        covariance[:, 2, 2] += (rim_error(task.view) * particles[:, 2]) ** 2
     beyond = np.isin(particles[:, 2], task.depths_mm)
     covariance[beyond, 2, 2] += (MARGIN_DEPTHS * task.view.scale.depth_mm) ** 2
     to_world = task.camera.to_image_axes(np.eye(3))
