@@ -3,7 +3,8 @@
 Seen from a pixel's patch of the main lens, the share P(X) of the ball whose light falls into the lens's cell is, along
 each axis of a square cell, a difference of two of the ball's marginal distributions (cubics); mean and slope of P over
 the patch come from a three-point Gauss rule, and the two axes are joined by the patch's covered share and its first
-moments (`covered_share`).
+moments (`covered_share`). Where the array is turned each row of pixels has a profile of its own along x, moved by how
+far up in the cell it sees the ball, and each column one along y.
 
 Axes: image axes, mm; see `particles.view`. An *entry* is the meeting of a pixel with one lens; a pixel between two
 micro-images can have two.
@@ -31,19 +32,22 @@ PROFILE_ROWS = 8
 VALUES = 4
 
 
-class Profile(NamedTuple):
-    """What one lens shows along one axis: the first pixel, their number and their values (PROFILE_ROWS, number)."""
-
-    first: int
-    number: int
-    values: Floats
-
-
 class Lens(NamedTuple):
-    """What one lens shows along both axes, and what its profiles were moved by on the array for bent rays."""
+    """What one lens shows.
 
-    across: Profile
-    down: Profile
+    Attributes
+    ----------
+    column, columns, row, rows : the first pixels along both axes, and their numbers
+    across, down : (LONGEST, PROFILE_ROWS, LONGEST) of each row the profile along x, and of each column that along y
+    bent : what these were moved by on the array for bent rays
+    """
+
+    column: int
+    columns: int
+    row: int
+    rows: int
+    across: Floats
+    down: Floats
     bent: Bent
 
 
@@ -85,8 +89,8 @@ def respond(view: View, x: float, y: float, z: float, pixels: NDArray[np.int32],
         return 0
     projection = response.project(view, bend)
     low_i, high_i, low_j, high_j = lenses_of(view, projection, bend)
-    along_x = np.empty((PROFILE_ROWS, LONGEST))
-    along_y = np.empty((PROFILE_ROWS, LONGEST))
+    x_along, y_along = projection
+    across, down = np.zeros((2, LONGEST, PROFILE_ROWS, LONGEST))
     count = 0
     for j in range(low_j, high_j + 1):
         for i in range(low_i, high_i + 1):
@@ -95,29 +99,62 @@ def respond(view: View, x: float, y: float, z: float, pixels: NDArray[np.int32],
                 count += join_cell(view, projection, bend, (s_x, s_y), pixels[count:], values[count:])
                 continue
             bent = bent_at(view, projection, bend, s_x, s_y)
-            across = _profile(view, projection.x, (bent.x, bent.gain_x), s_x, along_x)
-            if across.number == 0:
-                continue
-            down = _profile(view, projection.y, (bent.y, bent.gain_y), s_y, along_y)
-            if down.number > 0:
-                lens = Lens(across, down, bent)
-                count += _join(view, projection, bend, lens, pixels[count:], values[count:])
+            of_x, of_y = (bent.x, bent.gain_x), (bent.y, bent.gain_y)
+            # What leans is beyond the upright cell by so much at most.
+            more_x, more_y = abs(view.lean_x) * view.half_y_mm, abs(view.lean_y) * view.half_x_mm
+            column, columns = _lit(view, x_along, of_x, s_x, more_x)
+            row, rows = _lit(view, y_along, of_y, s_y, more_y)
+            for m in range(rows):
+                up = _seen_at(view, y_along, of_y, s_y, row + m)
+                _fill(view, x_along, (bent.x + view.lean_x * up, bent.gain_x), s_x, (column, columns), across[m])
+            for n in range(columns):
+                right = _seen_at(view, x_along, of_x, s_x, column + n)
+                _fill(view, y_along, (bent.y + view.lean_y * right, bent.gain_y), s_y, (row, rows), down[n])
+            lens = Lens(column, columns, row, rows, across, down, bent)
+            count += _join(view, projection, bend, lens, pixels[count:], values[count:])
     return count
 
 
 @njit(cache=True)
-def _profile(view: View, along: Along, bent: tuple[float, float], s: float, out: Floats) -> Profile:
-    """Fill the profile of the lens at s along one axis, and return it; bent rays are moved as in `Bent`."""
+def _lit(view: View, along: Along, bent: tuple[float, float], s: float, more: float) -> tuple[int, int]:
+    """Return the first pixel that the lens at s lights along one axis, and their number; bent rays moved as in `Bent`.
+
+    Its cell reaches further by `more`.
+    """
+    at, gain, shift = along.at + bent[0], along.stretch * along.alpha + bent[1], _shift(view, along, s)
+    return lit_pixels(view, gain, at - s, along.half + along.radius + more, along.scale, shift, along.pixels)
+
+
+@njit(cache=True)
+def _shift(view: View, along: Along, s: float) -> float:
+    """Return where the lens at s shows the middle of the main lens on the sensor, along one axis."""
+    return (1.0 - view.camera.bend) * s - along.lever * along.beta * along.x
+
+
+@njit(cache=True)
+def _patch(view: View, along: Along, s: float, pixel: int) -> float:
+    """Return the middle of the main lens's patch that a pixel sees through the lens at s, along one axis."""
+    return ((pixel + 0.5 - 0.5 * along.pixels) * view.camera.pixel_mm - _shift(view, along, s)) / along.scale
+
+
+@njit(cache=True)
+def _seen_at(view: View, along: Along, bent: tuple[float, float], s: float, pixel: int) -> float:
+    """Return how far off the lens at s a pixel sees the middle of the ball on the array, along one axis."""
+    patch = _patch(view, along, s, pixel)
+    return along.at + bent[0] + (along.stretch * along.alpha + bent[1]) * patch - s
+
+
+@njit(cache=True)
+def _fill(view: View, along: Along, bent: tuple[float, float], s: float, lit: tuple[int, int], out: Floats) -> None:
+    """Fill the profile (PROFILE_ROWS, LONGEST) of the lens at s along one axis; bent rays are moved as in `Bent`."""
     camera = view.camera
     x, beta, slope, stretch = along.x, along.beta, along.slope, along.stretch
-    scale, lever = along.scale, along.lever
-    half, radius, growth, pixels = along.half, along.radius, along.growth, along.pixels
+    scale, lever, half, radius, growth = along.scale, along.lever, along.half, along.radius, along.growth
     at, gain = along.at + bent[0], stretch * along.alpha + bent[1]
-    shift = (1.0 - camera.bend) * s - lever * beta * x
-    first, count = lit_pixels(view, gain, at - s, half + radius, scale, shift, pixels)
+    first, count = lit
     width = camera.pixel_mm / scale
     for k in range(count):
-        middle = ((first + k + 0.5 - 0.5 * pixels) * camera.pixel_mm - shift) / scale
+        middle = _patch(view, along, s, first + k)
         out[:, k] = 0.0
         out[PATCH, k] = middle
         for node in range(3):
@@ -141,7 +178,6 @@ def _profile(view: View, along: Along, bent: tuple[float, float], s: float, out:
             out[MEAN_Z, k] += weight * by_z
             out[SLOPE_Z, k] += 3.0 * weight * xi * by_z
             out[AWAY, k] += weight * (ball_moment(upper) - ball_moment(lower))
-    return Profile(first, count, out)
 
 
 @njit(cache=True)
@@ -150,8 +186,7 @@ def _join(view: View, projection: Projection, bend: Bend, lens: Lens, pixels: ND
     camera = view.camera
     count = 0
     of_x, of_y = projection
-    column, columns, along_x = lens.across
-    row, rows, along_y = lens.down
+    column, columns, row, rows = lens.column, lens.columns, lens.row, lens.rows
     # Patches are a few per cent wider one way than the other at most.
     width = mean_width(view, projection)
     norm = width * width / (np.pi * camera.aperture_radius_mm**2)
@@ -162,12 +197,16 @@ def _join(view: View, projection: Projection, bend: Bend, lens: Lens, pixels: ND
     bent = lens.bent
     per_x = 1.0 / (of_x.stretch * (of_x.alpha * place_x - of_x.beta) + bent.gain_x * place_x)
     per_y = 1.0 / (of_y.stretch * (of_y.alpha * place_y - of_y.beta) + bent.gain_y * place_y)
+    # What the array point moves by with z, of (X - x).
+    turn_x = of_x.slope * of_x.stretch - (of_x.stretch * of_x.alpha + bent.gain_x) * tilt_x
+    turn_y = of_y.slope * of_y.stretch - (of_y.stretch * of_y.alpha + bent.gain_y) * tilt_y
     outside = (camera.aperture_radius_mm + 0.71 * width) ** 2
     for m in range(rows):
-        v0, v1 = along_y[MEAN, m], along_y[SLOPE, m]
-        v0_y, v1_y, v0_z, v1_z = along_y[MEAN_X, m], along_y[SLOPE_X, m], along_y[MEAN_Z, m], along_y[SLOPE_Z, m]
-        patch_y = along_y[PATCH, m]
+        along_x = lens.across[m]
         for n in range(columns):
+            along_y = lens.down[n]
+            v0, v1, patch_y = along_y[MEAN, m], along_y[SLOPE, m], along_y[PATCH, m]
+            v0_y, v1_y, v0_z, v1_z = along_y[MEAN_X, m], along_y[SLOPE_X, m], along_y[MEAN_Z, m], along_y[SLOPE_Z, m]
             patch_x = along_x[PATCH, n]
             r2 = patch_x * patch_x + patch_y * patch_y
             if r2 >= outside:
@@ -179,12 +218,17 @@ def _join(view: View, projection: Projection, bend: Bend, lens: Lens, pixels: ND
             rim_y = patch_y + place_y * of_y.ball * along_y[AWAY, m] / max(v0, SMALLEST_SHARE)
             share, mean_x, mean_y, share_x, share_y = covered_share(rim_x, rim_y, width, camera.aperture_radius_mm)
             light = share * h0 * v0 + mean_x * h1 * v0 + mean_y * h0 * v1
-            by_x = share * h0_x * v0 + mean_x * h1_x * v0 + mean_y * h0_x * v1 + share_x * place_x * h0 * v0
-            by_y = share * h0 * v0_y + mean_x * h1 * v0_y + mean_y * h0 * v1_y + share_y * place_y * h0 * v0
+            # Profiles along x follow how far up the ball is seen, those along y how far right.
+            own_x = share * h0_x * v0 + mean_x * h1_x * v0 + mean_y * h0_x * v1
+            own_y = share * h0 * v0_y + mean_x * h1 * v0_y + mean_y * h0 * v1_y
+            by_x = own_x + view.lean_y * own_y + share_x * place_x * h0 * v0
+            by_y = own_y + view.lean_x * own_x + share_y * place_y * h0 * v0
             by_z_x = share * h0_z * v0 + mean_x * h1_z * v0 + mean_y * h0_z * v1
             by_z_x += share_x * (of_x.x - patch_x) * tilt_x * h0 * v0
+            by_z_x += view.lean_y * own_y * per_y * (patch_x - of_x.x) * turn_x
             by_z_y = share * h0 * v0_z + mean_x * h1 * v0_z + mean_y * h0 * v1_z
             by_z_y += share_y * (of_y.x - patch_y) * tilt_y * h0 * v0
+            by_z_y += view.lean_x * own_x * per_x * (patch_y - of_y.x) * turn_y
             slope_x, slope_y = displaced(bend, patch_x, patch_y)
             more_x = of_x.stretch * camera.image_distance_mm * slope_x - bent.x - bent.gain_x * patch_x
             more_y = of_y.stretch * camera.image_distance_mm * slope_y - bent.y - bent.gain_y * patch_y

@@ -30,10 +30,12 @@ RADIUS_MM = 0.025
 PLACES = [(0.31, -0.2, 3.0), (0.53, 0.21, 0.02), (-0.62, 0.4, 0.4), (0.2, 0.3, -4.0)]
 
 
-@pytest.fixture(scope="module", params=["square", "hexagonal"])
+@pytest.fixture(scope="module", params=["square", "hexagonal", "turned far"])
 def small(table2: Camera, request: pytest.FixtureRequest) -> Camera:
     """The paper's camera with a small sensor and an array that is turned, shifted and seen through distortion."""
-    lattice = Lattice.regular(0.1, request.param, np.deg2rad(0.12), (0.013, -0.02))
+    layout: Layout = "hexagonal" if request.param == "hexagonal" else "square"
+    turned = np.deg2rad(1.0 if request.param == "turned far" else 0.12)
+    lattice = Lattice.regular(0.1, layout, turned, (0.013, -0.02))
     return replace(table2, lattice=lattice, columns=400, rows=360, distortion_per_mm2=2e-4)
 
 
@@ -60,7 +62,11 @@ def test_response_is_what_rays_make(small: Camera, view: View, water: Media, pla
     # A thousandth of a voxel's width, and three hundredths in depth; near focus all light passes one lens, whichever
     # way the particle moves within it: no position to compare.
     moved = np.array([3e-4, 3e-4, 3e-3]) if abs(place[2]) >= 0.1 else np.inf
-    assert_rays_make(twin_image(view, place), traced, rays, moved)
+    light = twin_image(view, place)
+    assert_rays_make(light, traced, rays, moved)
+    # These rays fill the aperture evenly, and leave 0.002 to 0.0075; of an array that is turned by a degree upright
+    # cells leave 0.011 to 0.02.
+    assert np.abs(light[:, 0] - traced).sum() < 0.01
 
 
 @pytest.mark.thorough
@@ -155,10 +161,14 @@ def test_hexagonal_cells_share_out_all_light() -> None:
 ALL_PLACES = [(0.31, -0.2, 3.0), (0.53, 0.21, 0.02), (-0.063, 0.07, 0.2), (0.2, 0.3, -4.0), (1.08, 0.2, 1.0)]
 
 
-@pytest.fixture(scope="module", params=["square", "turned", "hexagonal", "behind a wall", "overlapping", "wide balls"])
+@pytest.fixture(
+    scope="module",
+    params=["square", "turned", "turned far", "hexagonal", "behind a wall", "overlapping", "wide balls"],
+)
 def any_view(table2: Camera, water: Media, request: pytest.FixtureRequest) -> View:
-    layout = "hexagonal" if request.param == "hexagonal" else "square"
-    lattice = Lattice.regular(0.1, layout, np.deg2rad(0.0 if request.param == "square" else 0.12), (0.013, -0.02))
+    layout: Layout = "hexagonal" if request.param == "hexagonal" else "square"
+    turned = {"square": 0.0, "turned far": -0.9}.get(request.param, 0.12)
+    lattice = Lattice.regular(0.1, layout, np.deg2rad(turned), (0.013, -0.02))
     camera = replace(table2, lattice=lattice, columns=400, rows=360, distortion_per_mm2=2e-4)
     wall = Window(camera.focus_distance_mm - 60.0, 5.0)
     space = ObjectSpace(water, wall, "exact") if request.param == "behind a wall" else None
@@ -337,8 +347,8 @@ def test_derivatives_by_true_coordinates_are_finite_differences(
 def test_rows_in_a_pipe_are_the_pixels_one_by_one(pipe_view: View, place: tuple[float, float, float]) -> None:
     slowly, quickly = twin_image(pipe_view, place), rows_image(pipe_view, place)
     assert slowly.any()
-    # Rows are in single precision.
-    assert np.all(np.abs(quickly - slowly) < 1e-4 * np.abs(slowly).max(axis=0))
+    # Rows are in single precision. Where cells lean slopes' own derivatives are left out.
+    assert np.all(np.abs(quickly - slowly) < np.array([1e-4, 2e-3, 2e-3, 2e-3]) * np.abs(slowly).max(axis=0))
 
 
 @pytest.mark.thorough

@@ -123,7 +123,7 @@ def respond_by_lines(view: View, bend: Bend, z: float, pixels: NDArray[np.int32]
             if of_x.number > 0 and of_y.number > 0 and count + of_x.number * of_y.number <= pixels.size:
                 responses = of_columns[i - low_i], of_rows[j - low_j]
                 number = _write_lens(view, projection, (of_x, of_y), responses, room, pixels[count:], values[:, count:])
-                _add_coma(view, projection, oblique, (s_x, s_y), pixels[count : count + number], values[:, count:])
+                _add_moved(view, projection, oblique, (s_x, s_y), pixels[count : count + number], values[:, count:])
                 count += number
     return count
 
@@ -333,7 +333,7 @@ def _write_lens(
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
-def _add_coma(
+def _add_moved(
     view: View,
     projection: Projection,
     oblique: Oblique,
@@ -341,14 +341,14 @@ def _add_coma(
     pixels: NDArray[np.int32],
     values: NDArray[np.float64],
 ) -> None:
-    """Add what coma moves of a lens's light, to first order.
+    """Add what coma moves of a lens's light, and where the sides of its cell lean, to first order.
 
     A pixel sees one place of the aperture, as far as rays from there meet the lens. But what depends on where light is
     comes through the lens's edges, which diffract that of all places that the lens sees: the more of the aperture these
     are, the less a pixel's light moves as its own place's, down to half of it (by images of waves).
     """
     (x_xx, x_yy, x_xy), (y_xx, y_yy, y_xy) = oblique.coma_x, oblique.coma_y
-    if x_xx == 0.0 and y_yy == 0.0:
+    if x_xx == 0.0 and y_yy == 0.0 and view.lean_x == 0.0 and view.lean_y == 0.0:
         return
     camera, x, y, (s_x, s_y) = view.camera, projection.x, projection.y, lens_mm
     radius = camera.aperture_radius_mm
@@ -358,7 +358,7 @@ def _add_coma(
     shift_x = (1.0 - camera.bend) * s_x - x.lever * x.beta * x.x
     shift_y = (1.0 - camera.bend) * s_y - y.lever * y.beta * y.x
     # From derivatives by x and y to those by the place on the array.
-    per_x, per_y, per_radius = -own / x.beta, -own / y.beta, 1.0 / radius
+    per_x, per_y, per_radius = -1.0 / x.beta, -1.0 / y.beta, 1.0 / radius
     for n in range(pixels.size):
         row, column = pixels[n] // camera.columns, pixels[n] % camera.columns
         at_x = ((column + 0.5 - 0.5 * camera.columns) * camera.pixel_mm - shift_x) / x.scale
@@ -369,5 +369,8 @@ def _add_coma(
         at_x, at_y = within * at_x, within * at_y
         further_x = at_x * (x_xx * at_x + x_xy * at_y) + x_yy * at_y * at_y - oblique.further_x
         further_y = at_x * (y_xx * at_x + y_xy * at_y) + y_yy * at_y * at_y - oblique.further_y
+        # How far up in its cell the lens shows the ball is by how much the sides are further right there.
+        further_x = own * further_x + view.lean_x * (y.at - s_y + y.stretch * y.alpha * radius * at_y)
+        further_y = own * further_y + view.lean_y * (x.at - s_x + x.stretch * x.alpha * radius * at_x)
         moved = further_x * per_x * values[1, n] + further_y * per_y * values[2, n]
         values[0, n] = max(values[0, n] + moved, 0.0)

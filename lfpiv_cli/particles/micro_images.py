@@ -33,12 +33,13 @@ DENSE, MOMENT = np.float32(0.75), np.float32(0.1875)
 # Rows of a profile: mean and slope of the share P of the ball that is seen, their derivatives by x and by z, those of
 # the mean's by x, and where what is seen of the ball is seen from; the patch's middle, by how much the middle of the
 # main lens shows the ball off the lens, what the profile was moved by for bent rays, how much further the lens stands
-# along the other axis, and how far from the axis the patch lies, or its twin (`rows`) where that is nearer.
+# along the other axis, how far from the axis the patch lies, or its twin (`rows`) where that is nearer, and by how much
+# profiles along the other axis are moved, over their derivative by x or y.
 MEAN, SLOPE, MEAN_X, SLOPE_X, MEAN_Z, SLOPE_Z, MEAN_XX, MEAN_XZ, SEEN_FROM = (row * STRIDE for row in range(9))
-PATCH, OFFSET, MOVED, DRIFT, AWAY = (row * STRIDE for row in range(9, 14))
+PATCH, OFFSET, MOVED, DRIFT, AWAY, LEAN = (row * STRIDE for row in range(9, 15))
 # In the table: the profile along x; of a row of pixels light and its derivatives; the profile along y.
-SHOWN, DOWN = 14 * STRIDE, 18 * STRIDE
-TABLE_SIZE = 32 * STRIDE
+SHOWN, DOWN = 15 * STRIDE, 19 * STRIDE
+TABLE_SIZE = 34 * STRIDE
 # Of a ball; what sees less sees nothing.
 SMALLEST_SHARE = np.float32(1e-9)
 # What the rim leaves of a patch that it does not touch: all; see `cells.covered_share`.
@@ -61,6 +62,8 @@ class Plane(NamedTuple):
     true_x, ..., per_distance : true x and y, and those seen, of bent rays, and 1/distance, see `refraction.Bend`
     node_0, ..., factor_4 : of the polynomial of their slopes
     more : what a profile changes by with these rays' slopes, over its derivative by x or y
+    lean_x, lean_y : of the cell's sides, see `view.View`
+    turn : by how much the ball is seen further along x or y with z, of (X - x), over what it is with x
     """
 
     place: Real
@@ -84,6 +87,9 @@ class Plane(NamedTuple):
     factor_3: Real
     factor_4: Real
     more: Real
+    lean_x: Real
+    lean_y: Real
+    turn: Real
 
 
 class Curved(NamedTuple):
@@ -99,6 +105,8 @@ class Curved(NamedTuple):
     moves : how the place in air and its two depths move with x, with y and with z
     more_x, more_y, bent_x, bent_y : what a profile changes by with rays' slopes, over its derivative by x or y, and
         what it was moved by already
+    lean_x, lean_y : of the cell's sides, see `view.View`
+    turn_x, turn_y : of `Plane.turn`, with the depths that are seen along x and along y
     """
 
     own_x: Real
@@ -115,6 +123,10 @@ class Curved(NamedTuple):
     more_y: Real
     bent_x: Real
     bent_y: Real
+    lean_x: Real
+    lean_y: Real
+    turn_x: Real
+    turn_y: Real
 
 
 @njit(**VECTORISED)
@@ -172,8 +184,8 @@ class Line(NamedTuple):
     Attributes
     ----------
     mean, ..., moved : of its profile
-    move, across, per_drift, down : by how much profiles along x are moved, over their derivative by x, and patches are;
-        and the same along y for how much further a column's lens stands
+    move, across, down : by how much profiles along x are moved, over their derivative by x, and patches are; and how
+        much further along y patches lie where a column's lens does
     """
 
     mean: Real
@@ -189,7 +201,6 @@ class Line(NamedTuple):
     moved: Real
     move: Real
     across: Real
-    per_drift: Real
     down: Real
 
 
@@ -209,9 +220,8 @@ def _line(table: Singles, row: int, per_drift: Singles) -> Line:
         down[SEEN_FROM],
         down[PATCH],
         down[MOVED],
-        per_drift[2] * down[DRIFT],
+        down[LEAN],
         per_drift[0] * down[DRIFT],
-        per_drift[3],
         per_drift[1],
     )
 
@@ -227,8 +237,7 @@ def join_row(
     columns : the first and their number
     rim : the width of a patch, the main lens's radius, and the square of the distance from its axis within which the
         rim leaves all of a patch
-    per_drift : (4,) how much further patches lie along x and y where lenses do, and what profiles change by, over
-        their derivatives by x and y
+    per_drift : (2,) how much further patches lie along x and y where lenses do
     """
     line = _line(table, row, per_drift)
     for begin in range(0, columns[1], WIDTH):
@@ -259,24 +268,41 @@ def _covered(rows: Singles, n: int, line: Line, rim: tuple[Real, Real, Real]) ->
 
 
 @njit(inline="always", **VECTORISED)
+def _moved(rows: Singles, n: int, line: Line) -> tuple[Four, Four]:
+    """Return mean, slope, and the mean's derivatives of one column's profiles where they are moved to."""
+    move_x, move_y, h0_xx = line.move, rows[LEAN + n], rows[MEAN_XX + n]
+    across = (
+        rows[MEAN + n] + move_x * (rows[MEAN_X + n] + HALF * move_x * h0_xx),
+        rows[SLOPE + n] + move_x * rows[SLOPE_X + n],
+        rows[MEAN_X + n] + move_x * h0_xx,
+        rows[MEAN_Z + n] + move_x * rows[MEAN_XZ + n],
+    )
+    down = (
+        line.mean + move_y * (line.mean_y + HALF * move_y * line.mean_yy),
+        line.slope + move_y * line.slope_y,
+        line.mean_y + move_y * line.mean_yy,
+        line.mean_z + move_y * line.mean_yz,
+    )
+    return across, down
+
+
+@njit(inline="always", **VECTORISED)
 def _join(rows: Singles, n: int, line: Line, cover: tuple[Real, Real, Real, Real, Real], of: Plane) -> None:
     """Fill in light and derivatives of one column."""
     share, mean_x, mean_y, share_x, share_y = cover
-    h1_x, h1_z, h0_xx, v1_y, v1_z = rows[SLOPE_X + n], rows[SLOPE_Z + n], rows[MEAN_XX + n], line.slope_y, line.slope_z
-    move_x, move_y = line.move, line.per_drift * rows[DRIFT + n]
-    h0 = rows[MEAN + n] + move_x * (rows[MEAN_X + n] + HALF * move_x * h0_xx)
-    v0 = line.mean + move_y * (line.mean_y + HALF * move_y * line.mean_yy)
-    h0_x, v0_y = rows[MEAN_X + n] + move_x * h0_xx, line.mean_y + move_y * line.mean_yy
-    h0_z, v0_z = rows[MEAN_Z + n] + move_x * rows[MEAN_XZ + n], line.mean_z + move_y * line.mean_yz
-    h1, v1 = rows[SLOPE + n] + move_x * h1_x, line.slope + move_y * v1_y
+    h1_x, h1_z, v1_y, v1_z = rows[SLOPE_X + n], rows[SLOPE_Z + n], line.slope_y, line.slope_z
+    (h0, h1, h0_x, h0_z), (v0, v1, v0_y, v0_z) = _moved(rows, n, line)
     patch_x, patch_y = rows[PATCH + n] + line.across, line.patch + line.down * rows[DRIFT + n]
     whole = h0 * v0
     # Profiles with what the rim leaves of their slopes.
     across, down = share * h0 + mean_x * h1, share * v0 + mean_y * v1
     light = across * v0 + mean_y * (h0 * v1)
-    by_x = h0_x * down + mean_x * (h1_x * v0) + share_x * (of.place * whole)
-    by_y = v0_y * across + mean_y * (h0 * v1_y) + share_y * (of.place * whole)
+    # With profiles' places alone; where cells lean, these follow the other axis.
+    own_x, own_y = h0_x * down + mean_x * (h1_x * v0), v0_y * across + mean_y * (h0 * v1_y)
+    led_x, led_y = of.lean_x * own_x, of.lean_y * own_y
+    by_x, by_y = own_x + led_y + share_x * (of.place * whole), own_y + led_x + share_y * (of.place * whole)
     by_z = h0_z * down + v0_z * across + mean_x * (h1_z * v0) + mean_y * (h0 * v1_z)
+    by_z += (led_y * (patch_x - of.own_x) + led_x * (patch_y - of.own_y)) * of.turn
     by_z += (share_x * (of.own_x - patch_x) + share_y * (of.own_y - patch_y)) * (of.tilt * whole)
     dx, dy = patch_x - of.true_x, patch_y - of.true_y
     d2 = dx * dx + dy * dy
@@ -326,19 +352,24 @@ def _join_curved(
     """Fill in light and derivatives of one column behind curved faces, where each lens has its own profiles."""
     share, mean_x, mean_y, share_x, share_y = cover
     (a0, a1, a2, a3), (b0, b1, b2, b3) = slopes
-    v0, v1, h0, h1, patch_x = line.mean, line.slope, rows[MEAN + n], rows[SLOPE + n], rows[PATCH + n]
+    (h0, h1, h0_x, h0_z), (v0, v1, v0_y, v0_z) = _moved(rows, n, line)
+    patch_x = rows[PATCH + n]
     share_x, share_y = share_x * (h0 * v0), share_y * (h0 * v0)
     # Profiles with what the rim leaves of their slopes.
     across, down = share * h0 + mean_x * h1, share * v0 + mean_y * v1
     light = across * v0 + mean_y * (h0 * v1)
-    by_x = rows[MEAN_X + n] * down + mean_x * (rows[SLOPE_X + n] * v0) + share_x * of.place_x
-    by_y = line.mean_y * across + mean_y * (h0 * line.slope_y) + share_y * of.place_y
+    own_x = h0_x * down + mean_x * (rows[SLOPE_X + n] * v0)
+    own_y = v0_y * across + mean_y * (h0 * line.slope_y)
+    led_x, led_y = of.lean_x * own_x, of.lean_y * own_y
+    by_x, by_y = own_x + led_y + share_x * of.place_x, own_y + led_x + share_y * of.place_y
     light += by_x * (of.more_x * (a0 + patch_x * (a1 + patch_x * (a2 + patch_x * a3))) - of.bent_x)
     light += by_y * (of.more_y * (b0 + patch_x * (b1 + patch_x * (b2 + patch_x * b3))) - of.bent_y)
-    deep_x = rows[MEAN_Z + n] * down + mean_x * (rows[SLOPE_Z + n] * v0)
+    deep_x = h0_z * down + mean_x * (rows[SLOPE_Z + n] * v0)
     deep_x += share_x * ((of.own_x - patch_x) * of.tilt_x) + of.widen_x * light
-    deep_y = line.mean_z * across + mean_y * (h0 * line.slope_z)
+    deep_x += led_y * ((patch_x - of.own_x) * of.turn_x)
+    deep_y = v0_z * across + mean_y * (h0 * line.slope_z)
     deep_y += share_y * ((of.own_y - line.patch) * of.tilt_y) + of.widen_y * light
+    deep_y += led_x * ((line.patch - of.own_y) * of.turn_y)
     shown = of.norm if light > ZERO else ZERO
     rows[SHOWN + n] = shown * light
     x, y, z = of.moves

@@ -20,6 +20,7 @@ from lfpiv_cli.particles.micro_images import (
     AWAY,
     DOWN,
     DRIFT,
+    LEAN,
     LONGEST,
     MOVED,
     OFFSET,
@@ -62,7 +63,7 @@ class Scratch(NamedTuple):
     Attributes
     ----------
     table : of `micro_images`
-    per_drift : (4,) of `join_row`
+    per_drift : (2,) of `join_row`
     lines : (6, STRIDE) of each column and row of the table, see `PLACE`
     lenses : of each block, see `respond_rows`
     """
@@ -114,7 +115,7 @@ class Block(NamedTuple):
 @njit(cache=True)
 def scratch(capacity: int) -> Scratch:
     """Return the room for so many entries."""
-    table, per_drift = np.zeros(TABLE_SIZE, np.float32), np.zeros(4, np.float32)
+    table, per_drift = np.zeros(TABLE_SIZE, np.float32), np.zeros(2, np.float32)
     return Scratch(table, per_drift, np.zeros((6, STRIDE), np.int64), np.empty((capacity + 1, 5), np.int64))
 
 
@@ -194,7 +195,7 @@ def _write_blocks(
 def _shared(view: View, projection: Projection, bend: Bend, i: int, j: int) -> tuple[int, float]:
     """Return how many lenses along a side of a block share profiles, and what moves these by how much at most, mm.
 
-    Lenses that are not in line, by how much those next to lens (i, j) are not, and bent rays do.
+    Lenses that are not in line, by how much those next to lens (i, j) are not, and bent rays do; and cells that lean.
     """
     if view.cell_table.shape[0] > 0 or bend.cubic.shape[0] > 0:
         return 1, 0.0
@@ -202,7 +203,8 @@ def _shared(view: View, projection: Projection, bend: Bend, i: int, j: int) -> t
     i, j = min(i, centres.shape[1] - 2), min(j, centres.shape[0] - 2)
     drift = max(abs(centres[j + 1, i, 0] - centres[j, i, 0]), abs(centres[j, i + 1, 1] - centres[j, i, 1]))
     bent = view.camera.image_distance_mm * largest_displacement(bend, view.camera.aperture_radius_mm)
-    within = SHARED * min(x.radius, y.radius) - BENT_UNLIKE * bent
+    leaning = max(abs(view.lean_x) * y.half, abs(view.lean_y) * x.half)
+    within = SHARED * min(x.radius, y.radius) - BENT_UNLIKE * bent - leaning
     if within < 0.0:
         return 1, 0.0
     # Pixels of one lens along a line at most.
@@ -249,6 +251,9 @@ def _plane(view: View, projection: Projection, bend: Bend) -> Plane:
         single(factors[3] if bent else 0.0),
         single(factors[4] if bent else 0.0),
         single(view.camera.image_distance_mm * x.stretch / _by_place(x, x.stretch * x.alpha) if bent else 0.0),
+        single(view.lean_x),
+        single(view.lean_y),
+        single(_turn(x, x.stretch * x.alpha) / _by_place(x, x.stretch * x.alpha)),
     )
 
 
@@ -257,8 +262,8 @@ def _curved(view: View, projection: Projection, bend: Bend, bent: Bent) -> Curve
     """Return what the pixels of a lens, bent by so much, of a particle behind curved faces follow from."""
     single, (x, y), far = np.float32, projection, view.camera.image_distance_mm
     ratio_x, ratio_y = x.lever / x.scale, y.lever / y.scale
-    by_x = _by_place(x, x.stretch * x.alpha + bent.gain_x)
-    by_y = _by_place(y, y.stretch * y.alpha + bent.gain_y)
+    gain_x, gain_y = x.stretch * x.alpha + bent.gain_x, y.stretch * y.alpha + bent.gain_y
+    by_x, by_y = _by_place(x, gain_x), _by_place(y, gain_y)
     return Curved(
         single(x.x),
         single(y.x),
@@ -274,6 +279,10 @@ def _curved(view: View, projection: Projection, bend: Bend, bent: Bent) -> Curve
         single(far * y.stretch / by_y),
         single(bent.x / by_x),
         single(bent.y / by_y),
+        single(view.lean_x),
+        single(view.lean_y),
+        single(_turn(x, gain_x) / by_x),
+        single(_turn(y, gain_y) / by_y),
     )
 
 
@@ -317,11 +326,8 @@ def _write_block(
     _fill(view, y, y.stretch * y.alpha + bent.gain_y, rows, room.table[DOWN:])
     for k in range(2):
         along = x if k == 0 else y
-        # With a lens that stands further along its image does, and what the lens is off the ball.
-        further = (1.0 - camera.bend) / along.scale
-        gain = along.stretch * along.alpha
-        room.per_drift[k] = -further
-        room.per_drift[2 + k] = -(1.0 + gain * further) / _by_place(along, gain)
+        # With a lens that stands further along its image does.
+        room.per_drift[k] = -(1.0 - camera.bend) / along.scale
     return _write_rows(view, projection, (bend, bent), (rows, columns), begin, entries, rectangle)
 
 
@@ -329,6 +335,12 @@ def _write_block(
 def _by_place(along: Along, gain: float) -> float:
     """Return how what a lens is off the ball, as a pixel sees it, changes with the ball's place."""
     return along.beta * (gain * along.lever / along.scale - along.stretch)
+
+
+@njit(cache=True, **COUNT_NO_REFERENCES)
+def _turn(along: Along, gain: float) -> float:
+    """Return how it changes with the ball's depth, of (X - x)."""
+    return along.slope * (along.stretch - gain * along.lever / along.scale)
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
@@ -346,6 +358,12 @@ def _line_up(
     middle_i, middle_j = block.i + block.columns // 2, block.j + block.rows // 2
     middle = centres[middle_j, middle_i, 1 - axis]
     by_place = _by_place(along, along.stretch * along.alpha)
+    # Along the other axis a lens is further off the ball where it stands further, and its cell's sides where they lean.
+    other, lean = (projection.y, view.lean_y) if axis == 0 else (projection.x, view.lean_x)
+    leaning = abs(view.lean_x if axis == 0 else view.lean_y) * other.half
+    other_gain = other.stretch * other.alpha + (rays[1].gain_y if axis == 0 else rays[1].gain_x)
+    per_mm = 1.0 / _by_place(other, other_gain)
+    per_drift = -(1.0 + other_gain * (1.0 - camera.bend) / other.scale) * per_mm
     count = 0
     for n in range(block.columns if axis == 0 else block.rows):
         i, j = (block.i + n, middle_j) if axis == 0 else (middle_i, block.j + n)
@@ -356,12 +374,14 @@ def _line_up(
         moved, gain = (bent.x, bent.gain_x) if axis == 0 else (bent.y, bent.gain_y)
         offset, gain = along.at + moved - s, along.stretch * along.alpha + gain
         shift = (1.0 - camera.bend) * s - along.lever * along.beta * along.x
-        reach = along.half + along.radius + block.more_mm
+        reach = along.half + along.radius + block.more_mm + leaning
         first, number = lit_pixels(view, gain, offset, reach, along.scale, shift, along.pixels)
         earlier = count - 1
         for place in range(first, first + min(number, LONGEST - count)):
             table[PATCH + count] = ((place + 0.5 - 0.5 * along.pixels) * camera.pixel_mm - shift) / along.scale
-            table[OFFSET + count], table[DRIFT + count] = offset, centres[j, i, 1 - axis] - middle
+            drift = centres[j, i, 1 - axis] - middle
+            table[OFFSET + count], table[DRIFT + count] = offset, drift
+            table[LEAN + count] = per_drift * drift + lean * per_mm * (offset + gain * table[PATCH + count])
             table[MOVED + count] = moved / by_place
             places[count], twins[count] = place, -1
             before = earlier
@@ -416,7 +436,7 @@ def _order_columns(room: Scratch, columns: int, width: float) -> None:
         step = min(int(table[AWAY + n] * per), STRIDE - 2)
         targets[n] = starts[step]
         starts[step] += 1
-    for k in range(5):
+    for k in range(6):
         for n in range(columns):
             table[n] = table[PATCH + k * STRIDE + n]
         for n in range(columns):
@@ -435,7 +455,7 @@ def _fill(view: View, along: Along, gain: float, count: int, out: Singles) -> No
         np.float32(gain),
         np.float32(_by_place(along, gain)),
         np.float32(along.x),
-        np.float32(along.slope * (along.stretch - gain * ratio)),
+        np.float32(_turn(along, gain)),
         np.float32(along.half),
         np.float32(1.0 / along.radius),
         np.float32(along.growth),

@@ -54,7 +54,9 @@ class View(NamedTuple):
     depth_ratio : n_a/n_w (Eq. 9)
     layers : from the lens to the focal point, of plane faces that bend rays by Snell's law; one where rays are straight
     faces : curved ones; none where all are plane
-    half_x_mm, half_y_mm : half the rectangle that holds a lens's cell
+    half_x_mm, half_y_mm : how far a square cell's sides are from its lens along x and along y; half the rectangle that
+        holds a hexagonal one
+    lean_x, lean_y : how much further along x the sides of a square cell are further along y, and along y along x
     corner_mm : how far a cell's corners are from its lens
     cell_reach : how far a cell reaches at most from its lens, in steps of the lattice
     cell_table, cell_side2_mm2, cell_step_mm, cell_ball_mm : of cells that are no rectangles, or rays bent far, see
@@ -74,6 +76,8 @@ class View(NamedTuple):
     faces: Faces
     half_x_mm: float
     half_y_mm: float
+    lean_x: float
+    lean_y: float
     corner_mm: float
     cell_reach: float
     cell_table: Floats
@@ -183,7 +187,9 @@ def raw_view(
     lattice = camera.lattice
     scale = camera.scale(media)
     radius = max(particle_radius_mm, SMALLEST_RADIUS_LENSES * scale.lens_mm)
-    half_x, half_y = 0.5 * lattice.pitch if lattice.layout == "square" else 2 * (cell_radius(lattice),)
+    basis = lattice.basis
+    along_axes = 0.5 * np.sum(basis**2, axis=1) / np.diagonal(basis)
+    half_x, half_y = along_axes if lattice.layout == "square" else 2 * (cell_radius(lattice),)
     bent_mm = 0.0 if plane.straight else refraction_error_mm(camera, media, plane.window, np.zeros(1))
     shares = NO_SHARES
     if lattice.layout != "square" or (light is None and bent_mm > BENT_FAR * lattice.pitch.min()):
@@ -196,6 +202,8 @@ def raw_view(
         faces=space.for_kernels(camera) if isinstance(space, CurvedSpace) else NO_FACES,
         half_x_mm=float(half_x),
         half_y_mm=float(half_y),
+        lean_x=float(basis[0, 1] / basis[0, 0]),
+        lean_y=float(basis[1, 0] / basis[1, 1]),
         corner_mm=cell_radius(lattice),
         cell_reach=0.5 if lattice.layout == "square" else 2.0 / 3.0,
         cell_table=shares.table,
