@@ -20,6 +20,7 @@ from lfpiv_cli.particles.noise import (
     Correlation,
     Noise,
     error_correlation,
+    mean_whole,
     measured_noise,
     read_noise,
 )
@@ -349,6 +350,27 @@ def test_noise_of_light_is_found_of_whole_counts(rng: np.random.Generator) -> No
     for light in (4.0, 12.0):
         weight = found.weights(np.full(1, light), np.zeros(1), 0.0)
         assert 1.0 / weight == pytest.approx(0.06 * light + ROUNDING_COUNTS**2, rel=0.3)
+
+
+def test_edges_are_wrong_by_as_much_where_they_are_dim(rng: np.random.Generator) -> None:
+    """At the rim of lens images the model is off by a share of the light beside, however little a pixel has."""
+    model = rng.uniform(1.0, 16.0, 60_000)
+    true = Noise(ROUNDING_COUNTS, 0.01, 0.0, 0.4)
+    left = rng.normal(size=model.size) / np.sqrt(true.weights(model, np.zeros_like(model), 0.0))
+    found = measured_noise(model, left, np.ones(model.size, np.bool_), Noise(ROUNDING_COUNTS, 1.0), rims=True)
+    for light in (2.0, 12.0):
+        expected, measured = (each.weights(np.full(1, light), np.zeros(1), 0.0) for each in (true, found))
+        assert measured == pytest.approx(expected, rel=0.15)
+    # Dark pixels are as noisy as they were, and faint light is not wrong by more than it is.
+    assert found.weights(np.zeros(1), np.zeros(1), 0.0) == pytest.approx(ROUNDING_COUNTS**-2)
+    assert found.weights(np.full(1, 0.1), np.zeros(1), 0.0) > 1.0 / (ROUNDING_COUNTS**2 + 0.1**2 + 0.01)
+
+
+def test_mean_of_whole_counts_is_that_of_many(rng: np.random.Generator) -> None:
+    counts = rng.uniform(-1.0, 9.0, 40)
+    for sigma in (0.0, 0.1, 0.4, 0.9):
+        many = np.rint(counts + sigma * rng.normal(size=(20_000, 40))).mean(axis=0)
+        assert mean_whole(counts, np.full(40, sigma)) == pytest.approx(many, abs=0.03)
 
 
 @pytest.mark.thorough

@@ -198,7 +198,7 @@ def test_rows_are_the_pixels_one_by_one(any_view: View, place: tuple[float, floa
 
 
 def test_weights_of_pixels_are_those_of_the_noise(rng: np.random.Generator) -> None:
-    noise = Noise(5.0, 0.7, 0.03)
+    noise = Noise(5.0, 0.7, 0.03, 20.0)
     image, residual = rng.normal(100.0, 90.0, 500), rng.normal(0.0, 60.0, 500)
     usable = rng.random(500) < 0.9
     found = pixel_weights(noise, image, residual, usable, 0.1)

@@ -12,6 +12,7 @@ from lfpiv_cli.arrays import Floats
 from lfpiv_cli.calibration.white import vignetting_surface
 from lfpiv_cli.files.config import carried_config
 from lfpiv_cli.files.weights_file import WeightsFile
+from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media
 from lfpiv_cli.particles import search
@@ -19,13 +20,29 @@ from lfpiv_cli.particles.camera_light import FocalLength, focal_length_of
 from lfpiv_cli.particles.fitting import add_all, refine
 from lfpiv_cli.particles.joining import with_twins_joined
 from lfpiv_cli.particles.least_squares import SMALLEST_GAIN, observation_of
-from lfpiv_cli.particles.search import State, Task, blank, noise_with, observed, rebuilt
+from lfpiv_cli.particles.noise import ROUNDING_COUNTS
+from lfpiv_cli.particles.search import (
+    LAST_SWEEPS,
+    LAST_UNEXPLAINED,
+    LIT_COUNTS,
+    State,
+    Task,
+    blank,
+    noise_with,
+    observed,
+    rebuilt,
+    result,
+    sweep,
+    with_measured_noise,
+    with_offset_known,
+)
 from lfpiv_cli.particles.view import View, raw_view
 from lfpiv_cli.verbs.frames import Bench, bench_of, frame_notices
 from lfpiv_cli.verbs.particles import find, frame_of, points_of, task_for, tracers_per_lens
 from lfpiv_cli.verbs.tracers import TracerSize, light_notices
 from tests.commands import AT_FOCUS, sample_rig
-from tests.particle_images import found, light_on, task_with
+from tests.particle_images import found, light_on, seen_by, task_with
+from tests.particle_images import task_for as task_of_image
 
 TYPICAL = 5e5
 # Half the distance of two that share a tracer's light: a tenth of a microlens, a twentieth of a millimetre of depth.
@@ -67,6 +84,38 @@ def test_read_noise_is_that_of_pixels_that_are_read(task: Task) -> None:
     # The gap of a pixel that is left out is filled from those around it.
     counts[7], usable[7] = -0.37, False
     assert replace(task, image=counts, usable=usable).read_counts == pytest.approx(2.0, rel=0.03)
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("dark", [2.6, 3.3, 3.0])
+def test_light_that_is_rounded_shows_where_dark_is(
+    table2: Camera, water: Media, tracers: Floats, rng: np.random.Generator, dark: float
+) -> None:
+    """Of tracers of 15 counts with hardly any noise: of a dark level of 2.6 the dark image shows 3, their light 2.6."""
+    camera, grid = replace(table2, columns=500, rows=420), Grid.centred((20, 16, 20), (0.1, 0.1, 0.1), (0.0, 0.0, 1.9))
+    true = tracers * (1.0, 1.0, 1.0, 0.008)
+    light = seen_by(camera, water, true, grid.bounds_mm(2))
+    recorded = np.rint(rng.poisson(50.0 * light) / 50.0 + dark + rng.normal(0.0, 0.03, light.size)) - np.rint(dark)
+    task = task_of_image(recorded, camera, water, grid, haze_error=np.full((420, 500), ROUNDING_COUNTS, np.float32))
+    start = rebuilt(task, blank(task), true.copy())
+    start = with_measured_noise(task, replace(start, typical_light=0.008 * TYPICAL, noise=noise_with(task, 4e3)))
+    for _ in range(3):
+        sweep(task, start, LAST_UNEXPLAINED, LAST_SWEEPS)
+    known, state = with_offset_known(task, with_measured_noise(task, start))
+    assert known.haze is not None
+    assert known.haze_error is not None
+    assert np.median(known.haze[light > LIT_COUNTS]) == pytest.approx(dark - np.rint(dark), abs=0.04)
+    assert np.abs(known.haze[light == 0.0]).max() < 0.01
+    assert known.haze_error.max() < 0.02
+    # With dark as its image shows it depths are wrong by 0.02 to 0.03 mm; where that is right noise makes it 0.004.
+    assert np.sqrt(np.mean((state.particles - true)[:, 2] ** 2)) < 0.006
+    # Of 45 tracers: of 95 % three are fewer at most by chance.
+    end = result(task, start)
+    away, number = KDTree(camera.to_image_axes(true[:, :3])).query(end.position_mm)
+    error = end.position_mm - camera.to_image_axes(true[number, :3])
+    assert away.max() < 0.1
+    sigma = np.sqrt(np.diagonal(end.covariance_mm2, axis1=1, axis2=2))
+    assert np.all(np.mean(np.abs(error) < 1.96 * sigma, axis=0) > 0.85)
 
 
 @pytest.mark.thorough

@@ -24,6 +24,8 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
+from scipy.sparse.linalg import lsmr
 from scipy.spatial import KDTree
 
 from lfpiv_cli.arrays import Floats
@@ -45,6 +47,8 @@ from lfpiv_cli.threads import blocks, in_threads
 FREE_NEIGHBOURS = 12
 # Particles that one thread takes at a time.
 BLOCK = 64
+# What of a change particles can make is known to this share.
+SMALL_REST = 1e-4
 
 
 class Slopes(NamedTuple):
@@ -117,10 +121,32 @@ def joint_covariance(
     return result
 
 
+def change_shown(observation: Observation, particles: Floats, change: Floats) -> tuple[float, float]:
+    """Return how much of a change (pixels,) is in what particles (n, 4) leave of an image, and its standard error.
+
+    By least squares with all of them free; 0 and infinite where they can make all of it.
+    """
+    counts, pixel, slope = _all_slopes(observation, particles)
+    root, first = np.sqrt(observation.weight), UNKNOWNS * np.repeat(np.arange(len(counts)), counts)
+    unknown = (first[:, np.newaxis] + np.arange(UNKNOWNS)).ravel()
+    # Millimetres beside counts: columns of length one.
+    length = np.sqrt(np.bincount(unknown, np.square(slope, dtype=np.float64).ravel(), UNKNOWNS * len(counts)))
+    entries = slope.ravel() / np.maximum(length[unknown], np.finfo(np.float64).tiny)
+    slopes = csr_array((entries, (np.repeat(pixel, UNKNOWNS), unknown)), (root.size, length.size))
+    beside, rest = (
+        each - slopes @ lsmr(slopes, each, atol=SMALL_REST, btol=SMALL_REST)[0]
+        for each in (root * change, root * observation.residual)
+    )
+    information, freedom = float(beside @ beside), np.count_nonzero(root) - length.size - 1
+    if not information > 0.0 or freedom < 1:
+        return 0.0, np.inf
+    scatter = max(float(rest @ rest) / freedom, 1.0)
+    return float(beside @ rest) / information, float(np.sqrt(scatter / information))
+
+
 def _equations(observation: Observation, particles: Floats) -> Equations:
     """Return the normal matrix of all particles."""
-    parts = in_threads(lambda part: _slopes_of(observation, particles[part]), blocks(len(particles), BLOCK))
-    counts, pixel, slope = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
+    counts, pixel, slope = _all_slopes(observation, particles)
     row, column = np.divmod(pixel, observation.optics.camera.columns, dtype=np.int32)
     slopes = Slopes(np.concatenate([[0], np.cumsum(counts)]), row, column, slope)
 
@@ -142,6 +168,15 @@ def _equations(observation: Observation, particles: Floats) -> Equations:
         blocks(len(particles), BLOCK),
     )
     return Equations(slopes, neighbours, alone, block, np.asarray(np.linalg.inv(alone), np.float64))
+
+
+def _all_slopes(
+    observation: Observation, particles: Floats
+) -> tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.float32]]:
+    """Return what `_slopes_of` does, particles shared out to threads."""
+    parts = in_threads(lambda part: _slopes_of(observation, particles[part]), blocks(len(particles), BLOCK))
+    counts, pixel, slope = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
+    return counts, pixel, slope
 
 
 @njit(cache=True, nogil=True)

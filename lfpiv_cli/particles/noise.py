@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
+from scipy.special import ndtr
 
 from lfpiv_cli.arrays import Floats
 from lfpiv_cli.kernels import COUNT_NO_REFERENCES, njit
@@ -25,6 +26,8 @@ MODEL_ERROR = 0.03
 PHOTONS_PER_PARTICLE = 2.5e5
 # Rounding to whole counts alone makes this standard deviation.
 ROUNDING_COUNTS = 0.29
+# Of as many counts to either side noise may make one; of less noise it is as of this.
+ROUNDING_STEPS, LEAST_SIGMA = 3, 1e-3
 # While particles are sought, dark pixels are not trusted beyond this share of what a typical particle's pixels hold: a
 # candidate a third of a microlens off lights dark pixels, and must not go out for it in an image with hardly any noise.
 LEAST_SHARE_OF_LIT = 0.003
@@ -46,16 +49,22 @@ ALIKE = 1e-6
 
 @dataclass(frozen=True)
 class Noise:
-    """Variance of a pixel: read^2 + gain M + (model_error M)^2, with the model M and the gain in counts per photon."""
+    """Variance of a pixel: read^2 + gain M + (model_error M)^2 + min(edge, M)^2.
+
+    With the model M, the gain in counts per photon, and what edges of lens images are wrong by, a share of the light
+    beside: it does not grow with a pixel's own light, and is no more than that.
+    """
 
     read_counts: float
     gain_counts: float
     model_error: float = MODEL_ERROR
+    edge_counts: float = 0.0
 
     def weights(self, model: Floats, residual: Floats, unexplained: float) -> Floats:
         """Return 1/variance of each pixel; light above the model adds `unexplained` times its square."""
         model = np.maximum(model, 0.0)
         variance = self.read_counts**2 + self.gain_counts * model + (self.model_error * model) ** 2
+        variance += np.minimum(self.edge_counts, model) ** 2
         return 1.0 / (variance + unexplained * np.maximum(residual, 0.0) ** 2)
 
     def of_dark(self, haze: Floats | None) -> float:
@@ -70,7 +79,7 @@ def pixel_weights(
 ) -> Floats:
     """Return `Noise.weights` (pixels,) of an image and what the model leaves of it; 0 where it is not usable."""
     weight = np.empty_like(image)
-    numbers = (noise.read_counts, noise.gain_counts, noise.model_error, unexplained)
+    numbers = (noise.read_counts, noise.gain_counts, noise.model_error, noise.edge_counts, unexplained)
     share_out(_fill_weights, image.size, numbers, image, residual, usable, weight)
     return weight
 
@@ -78,18 +87,18 @@ def pixel_weights(
 @njit(cache=True, nogil=True, error_model="numpy", **COUNT_NO_REFERENCES)
 def _fill_weights(
     part: tuple[int, int],
-    numbers: tuple[float, float, float, float],
+    numbers: tuple[float, float, float, float, float],
     image: Floats,
     residual: Floats,
     usable: NDArray[np.bool_],
     weight: Floats,
 ) -> None:
     """Do the work of `pixel_weights` for some pixels."""
-    read, gain, model_error, unexplained = numbers
+    read, gain, model_error, edge_counts, unexplained = numbers
     for k in range(part[0], part[1]):
         model, rest = max(image[k] - residual[k], 0.0), max(residual[k], 0.0)
-        error = model_error * model
-        variance = read * read + gain * model + error * error + unexplained * (rest * rest)
+        error, edge = model_error * model, min(edge_counts, model)
+        variance = read * read + gain * model + error * error + edge * edge + unexplained * (rest * rest)
         weight[k] = 1.0 / variance if usable[k] else 0.0
 
 
@@ -131,8 +140,10 @@ def _at_lag(error: Floats, lit: NDArray[np.bool_], lag: int, axis: int) -> float
     return float(np.einsum("ij,ij->", error[ahead], error[behind])) / pairs if pairs else 0.0
 
 
-def measured_noise(model: Floats, residual: Floats, usable: NDArray[np.bool_], noise: Noise) -> Noise:
-    """Return noise whose gain and model error are those that a fit leaves of an image.
+def measured_noise(
+    model: Floats, residual: Floats, usable: NDArray[np.bool_], noise: Noise, *, rims: bool = False
+) -> Noise:
+    """Return noise whose gain and errors are those that a fit leaves of an image.
 
     Light that was not found does not count: the median of the squares in each class of brightness is taken.
 
@@ -140,6 +151,7 @@ def measured_noise(model: Floats, residual: Floats, usable: NDArray[np.bool_], n
     ----------
     model, residual, usable : (pixels,)
     noise : taken for the read noise, and as it is where too little is lit
+    rims : whether edges of lens images are told apart; in crowds light that was not found looks like theirs
     """
     lit = np.flatnonzero(usable & (model > LIT_SIGMAS * noise.read_counts))
     lit = lit[:: max(lit.size // ENOUGH_PIXELS, 1)]
@@ -163,12 +175,12 @@ def measured_noise(model: Floats, residual: Floats, usable: NDArray[np.bool_], n
     brightness = np.array([np.mean(light[members]) for members in classes])
     squares = np.array([np.median(left[members] ** 2) for members in classes]) / HALF_NORMAL_MEDIAN**2
     variance = squares - ROUNDING_COUNTS**2
-    terms = np.column_stack([brightness, brightness**2])
+    terms = np.column_stack([brightness, brightness**2, np.full_like(brightness, rims)])
     if len(classes) < FEWEST_CLASSES:
-        terms[:, 1] = 0.0
+        terms[:, 1:] = 0.0
     # A variance is as sure as it is large.
-    (gain, error2), _ = nnls(terms / variance[:, np.newaxis], 1.0 - noise.read_counts**2 / variance)
-    return Noise(noise.read_counts, float(gain), float(np.sqrt(error2)))
+    (gain, error2, edge2), _ = nnls(terms / variance[:, np.newaxis], 1.0 - noise.read_counts**2 / variance)
+    return Noise(noise.read_counts, float(gain), float(np.sqrt(error2)), float(np.sqrt(edge2)))
 
 
 def beside_neighbours(residual: Floats, columns: int) -> Floats:
@@ -180,6 +192,13 @@ def beside_neighbours(residual: Floats, columns: int) -> Floats:
     beside = np.zeros_like(left)
     beside[:, 1:-1] = (2.0 * left[:, 1:-1] - left[:, :-2] - left[:, 2:]) / np.sqrt(6.0)
     return beside.ravel()
+
+
+def mean_whole(counts: Floats, sigma: Floats) -> Floats:
+    """Return the mean of whole counts that are recorded of these (pixels,) with noise of standard deviation sigma."""
+    lowest = np.floor(counts) - ROUNDING_STEPS
+    steps = np.arange(2 * ROUNDING_STEPS + 1)[:, np.newaxis]
+    return np.asarray(lowest + ndtr((counts - lowest - steps - 0.5) / np.maximum(sigma, LEAST_SIGMA)).sum(axis=0))
 
 
 def read_noise(image: Floats) -> float:

@@ -17,16 +17,18 @@ from scipy.special import ndtri
 
 from lfpiv_cli.arrays import Floats
 from lfpiv_cli.optics.camera import Camera
-from lfpiv_cli.particles.covariance import joint_covariance
+from lfpiv_cli.particles.covariance import change_shown, joint_covariance
 from lfpiv_cli.particles.fitting import add_all, judge, nothing_expected, other_ends, refine
 from lfpiv_cli.particles.least_squares import CHOICE_GAIN, SMALLEST_GAIN, Effort, Observation, observation_of
 from lfpiv_cli.particles.noise import (
     LEAST_SHARE_OF_LIT,
     LIT_SIGMAS,
     PHOTONS_PER_PARTICLE,
+    ROUNDING_COUNTS,
     Noise,
     beside_neighbours,
     error_correlation,
+    mean_whole,
     measured_noise,
     pixel_weights,
     read_noise,
@@ -113,6 +115,10 @@ SAME_LENSES, SAME_DEPTHS = 0.4, 0.25 / 1.064
 # larger tracers are and by its square the more pixels there are: of a tenth of a lens and 64, 144 and 400 pixels depths
 # are too small by 0.002, 0.0008 and 0.0002 in the mean over places, of 0.3 by 0.0008, 0.0002 and 0.00005.
 RIM_SHARE, RIM_PIXELS, RIM_LENSES = 4.0e-3, 64.0, 0.1
+# Counts are coarse where noise is this at most: 0.3 that is rounded, in an image and its dark one. Light above so many
+# is rounded up as often as down. Haze too faint to be told from none is uneven by this share. How light of about a
+# count is rounded follows from where particles are, and these from that: after so many rounds their errors are noise's.
+COARSE_COUNTS, LIT_COUNTS, UNEVEN_SHARE, OFFSET_ROUNDS = 0.6, 4.0, 0.3, 2
 # Particles this far in front of and behind the volume are kept, as they light it, in front at most this share of the
 # way to the lens: within 0.3 depths alone, tracers from further away end there, and with 30 % of all outside the
 # velocity in depth was 10 % too small.
@@ -391,11 +397,15 @@ def usual_light(state: State, fits: Fits, percentile: float) -> float:
     return float(np.percentile(light[chi2 <= np.median(chi2)], percentile)) if light.size else 0.0
 
 
-def with_measured_noise(task: Task, state: State) -> State:
-    """Return the state with the noise that its particles leave of the image, neighbours' light not counted."""
+def with_measured_noise(task: Task, state: State, *, rims: bool = False) -> State:
+    """Return the state with the noise that its particles leave of the image, neighbours' light not counted.
+
+    `rims` as in `measured_noise`.
+    """
     assumed = replace(state.noise, read_counts=task.read_counts)
     beside = beside_neighbours(state.residual, task.view.camera.columns)
-    return replace(state, noise=measured_noise(task.image - state.residual, beside, task.usable, assumed))
+    noise = measured_noise(task.image - state.residual, beside, task.usable, assumed, rims=rims)
+    return replace(state, noise=noise)
 
 
 def usual_chi2(chi2: Floats) -> float:
@@ -444,8 +454,42 @@ def rim_error(view: View) -> float:
     return RIM_SHARE / larger * (RIM_PIXELS / lens_pixels(view)) ** 2
 
 
+def with_offset_known(task: Task, state: State) -> tuple[Task, State]:
+    """Return the task with what rounding adds to light or takes off it, as particles show it, and the state with that.
+
+    With little noise a dark level between two counts is recorded as one of them, and where light varies from pixel to
+    pixel as either: all light is up to half a count off, and no dark pixel shows it.
+    """
+    image = task.image[task.usable]
+    whole = 2 * np.count_nonzero(image == np.rint(image)) > image.size
+    if task.read_counts > COARSE_COUNTS or not whole or not len(state.particles):
+        return task, state
+    model, observation = task.light - state.residual, observed(task, state, LAST_UNEXPLAINED)
+    lit = observation._replace(weight=np.where(model > LIT_COUNTS, observation.weight, 0.0))
+    shown, error = change_shown(lit, state.particles, np.ones_like(model))
+    # Between two counts it lies without any light.
+    variance = 1.0 / (ROUNDING_COUNTS**-2 + error**-2)
+    offset = variance / error**2 * shown
+    dark = task.usable & (model <= 0.0)
+    uneven = UNEVEN_SHARE * float(np.mean(state.residual[dark])) if dark.any() else 0.0
+    before = np.zeros_like(model) if task.haze_error is None else task.haze_error
+    after = np.sqrt(np.maximum(before**2 - ROUNDING_COUNTS**2, 0.0) + variance + uneven**2)
+    task = replace(task, haze_error=after)
+    haze = task.haze
+    for _ in range(OFFSET_ROUNDS):
+        light = np.maximum(task.light - state.residual, 0.0)
+        sigma = np.sqrt(task.read_counts**2 - ROUNDING_COUNTS**2 + state.noise.gain_counts * light)
+        added = mean_whole(light + offset, sigma) - light
+        task = replace(task, haze=added if haze is None else haze + added)
+        state = rebuilt(task, state, state.particles.copy())
+        sweep(task, state, LAST_UNEXPLAINED, LAST_SWEEPS)
+        state = with_measured_noise(task, state, rims=True)
+    return task, state
+
+
 def result(task: Task, state: State) -> Particles:
     """Return the particles in world axes, brightest first."""
+    task, state = with_offset_known(task, state)
     shape = task.prepared.shape
     order = np.argsort(-state.particles[:, 3], kind="stable")
     particles = state.particles[order]
