@@ -41,7 +41,7 @@ DEPTH_UNITS, DEEPEST = (3.0, 8.0), 0.35
 # Share of the field that the volume fills: at the sensor's rim a tracer is seen from one side only.
 FILLED = 0.8
 # Rays of each tracer, and of all of an image's: where tracers are many, neighbours cost more accuracy than rays' noise.
-RAYS, ALL_RAYS = (8_000, 40_000), 2e7
+RAYS, ALL_RAYS, MOST_RAYS = (8_000, 40_000), 2e7, 1e8
 # Photons of each of a tracer's rays, as far as its light is more than so many counts and this share of full scale. Rays
 # that fill the aperture evenly err where lens images end, by a quarter of what as many photons would: of more light
 # their errors, not photons, would be the noise, which is of no camera.
@@ -298,6 +298,7 @@ def _scene(
     rays, lens_px = float(np.clip(ALL_RAYS / particles, *RAYS)), 0.25 * np.pi * pitch_px**2
     least = max(LEAST_COUNTS, LEAST_SHARE * full) * lens_px
     light = min(share * full * lens_px, max(PHOTONS_OF_RAY * rays / photons, least))
+    rays = max(rays, min(light * photons / PHOTONS_OF_RAY, MOST_RAYS / particles))
     return {
         "particles": particles,
         "rays": round(rays),

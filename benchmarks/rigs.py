@@ -60,6 +60,8 @@ WHITE_SAMPLES = 4
 VERDICTS = ("worked", "refused", "failed", "unknown", "warned", "silent")
 # Steps that come before the work: what cannot work is to be refused in one of them.
 BEFORE_THE_WORK = ("calibrate-snapshot", "build-weights")
+# Bits of the finest sensor.
+FINEST_BITS = 16
 # Standard deviation of a speck's shadow in pixels, and its depth.
 SPECK_PX, SPECK_DEPTH = (0.7, 4.0), (0.1, 0.8)
 # A result is wrong where a slope is off by more (and by more than two of its standard errors), where less than this
@@ -192,8 +194,12 @@ def experiment(rig: DrawnRig, folder: Path, outcome: Outcome, volumes: bool) -> 
     true.write_text(yaml.safe_dump(rig.true))
     reported.write_text(yaml.safe_dump(rig.reported))
     photograph_white(true, images)
-    for what in ("board", "particles") if rig.board else ("particles",):
-        step = run_command("simulate", what, true, "-o", images)
+    simulated = {"board": true} if rig.board else {}
+    simulated["particles"] = folder / "finer.yaml" if rig.haze else true
+    if rig.haze:
+        simulated["particles"].write_text(yaml.safe_dump(recorded_finer(rig.true)))
+    for what, settings in simulated.items():
+        step = run_command("simulate", what, settings, "-o", images)
         if step.exit_code:
             outcome.steps.append(step)
             return
@@ -278,6 +284,18 @@ def photograph_white(config: Path, images: Path) -> None:
     write_tiff(images / "dark.tif", camera.dark_frame(rng), overwrite=True)
 
 
+def recorded_finer(true: dict[str, Any]) -> dict[str, Any]:
+    """Return a rig whose counts are those of the finest sensor, for light that is added before they are rounded."""
+    scene = true["simulation"]
+    finer = 2.0 ** (FINEST_BITS - scene["bits"])
+    counts = {name: finer * scene[f"{name}_counts"] for name in ("particle", "read_noise", "dark_level")}
+    return true | {
+        "simulation": scene
+        | {f"{name}_counts": value for name, value in counts.items()}
+        | {"photons_per_count": scene["photons_per_count"] / finer, "bits": FINEST_BITS}
+    }
+
+
 def veil(images: Path, rig: DrawnRig) -> None:
     """Add haze to the tracers' images: light of the white image's shape that fades to a half across the sensor."""
     scene, sensor = rig.true["simulation"], rig.true["camera"]["sensor"]
@@ -287,9 +305,9 @@ def veil(images: Path, rig: DrawnRig) -> None:
     lit = np.maximum(white - dark, 0.0)
     haze = rig.haze * lit / np.quantile(lit, 0.99) * np.linspace(1.0, 0.5, shape[1])
     per_photon = 1.0 / scene["photons_per_count"]
+    finer, full = 2.0 ** (FINEST_BITS - scene["bits"]), 2.0 ** scene["bits"] - 1.0
     for name in ("pair_a", "pair_b"):
-        image = read_image(images / f"{name}.tif", shape=shape) + rng.poisson(haze / per_photon) * per_photon
-        full = 2.0 ** scene["bits"] - 1.0
+        image = read_image(images / f"{name}.tif", shape=shape) / finer + rng.poisson(haze / per_photon) * per_photon
         write_tiff(images / f"{name}.tif", np.minimum(np.rint(image), full).astype(np.uint16), overwrite=True)
 
 
