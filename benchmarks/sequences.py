@@ -18,7 +18,7 @@ from benchmarks.particles import DIAMETER_MM, LIGHT_COUNTS, VOXEL_MM, Bench, cal
 from lfpiv_cli.files.particle_file import symmetric
 from lfpiv_cli.particles.neighbour_frames import Predicted, find_predicted, second_pass
 from lfpiv_cli.particles.rounds import first_pass
-from lfpiv_cli.particles.search import Particles, result
+from lfpiv_cli.particles.stated import Particles, result
 from lfpiv_cli.synthetic.flows import Flow, advect, random_modes, square_duct, taylor_green
 from lfpiv_cli.tracks import sequences
 from lfpiv_cli.tracks.candidates import Light, Seen, long_ones

@@ -15,7 +15,7 @@ from lfpiv_cli.files.weights_file import WeightsFile
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media
-from lfpiv_cli.particles import search
+from lfpiv_cli.particles import search, stated
 from lfpiv_cli.particles.camera_light import FocalLength, focal_length_of
 from lfpiv_cli.particles.fitting import add_all, refine
 from lfpiv_cli.particles.joining import with_twins_joined
@@ -24,18 +24,16 @@ from lfpiv_cli.particles.noise import ROUNDING_COUNTS
 from lfpiv_cli.particles.search import (
     LAST_SWEEPS,
     LAST_UNEXPLAINED,
-    LIT_COUNTS,
     State,
     Task,
     blank,
     noise_with,
     observed,
     rebuilt,
-    result,
     sweep,
     with_measured_noise,
-    with_offset_known,
 )
+from lfpiv_cli.particles.stated import LIT_COUNTS, result, with_offset_known
 from lfpiv_cli.particles.view import View, raw_view
 from lfpiv_cli.verbs.frames import Bench, bench_of, frame_notices
 from lfpiv_cli.verbs.particles import find, frame_of, points_of, task_for, tracers_per_lens
@@ -240,18 +238,18 @@ def view(table2: Camera, water: Media) -> View:
 def test_light_that_is_left_is_counted_without_noise(rng: np.random.Generator) -> None:
     image = rng.uniform(0.0, 500.0, 100_000)
     noise, wrong = rng.normal(0.0, 6.0, image.size), 0.2 * image * rng.choice([-1.0, 1.0], image.size)
-    assert search.light_left(image, noise, 6.0) < 0.003
-    assert search.light_left(image, noise + wrong, 6.0) == pytest.approx(0.2, abs=0.002)
-    assert search.light_left(np.zeros(4), np.zeros(4), 6.0) == 0.0
+    assert stated.light_left(image, noise, 6.0) < 0.003
+    assert stated.light_left(image, noise + wrong, 6.0) == pytest.approx(0.2, abs=0.002)
+    assert stated.light_left(np.zeros(4), np.zeros(4), 6.0) == 0.0
 
 
 def test_errors_grow_where_light_is_left_and_most_in_depth(view: View) -> None:
     particles = np.array([[0.0, 0.0, 0.1, 1e5], [0.0, 0.0, 3.0, 1e5]])
     covariance = np.tile(np.diag([1.0, 1.0, 900.0, 1e6]), (2, 1, 1)) + 0.5
-    np.testing.assert_array_equal(search.grown(view, particles, covariance, 0.09), covariance)
+    np.testing.assert_array_equal(stated.grown(view, particles, covariance, 0.09), covariance)
     before = covariance
     for left in (1.1, 1.3, 2.0):
-        found = search.grown(view, particles, covariance, 0.1 * left)
+        found = stated.grown(view, particles, covariance, 0.1 * left)
         assert np.all(np.linalg.eigvalsh(found) > 0.0)
         assert np.all(np.diagonal(found - before, axis1=1, axis2=2) > 0.0)
         before = found
@@ -269,7 +267,7 @@ def test_errors_know_what_is_missing_around(task: Task, tracers: Floats) -> None
     for particles in (tracers, np.delete(tracers, 3, axis=0)):
         state = search.with_measured_noise(task, begun_with(task, particles.copy()))
         search.sweep(task, state, 0.02, 6)
-        here = search.result(task, state)
+        here = stated.result(task, state)
         which = KDTree(task.camera.to_image_axes(here.position_mm)).query(tracers[23, :3])[1]
         assert here.chi2[which] < 1.0
         sigma.append(np.sqrt(here.covariance_mm2[which, 2, 2]))
@@ -278,7 +276,7 @@ def test_errors_know_what_is_missing_around(task: Task, tracers: Floats) -> None
 
 def test_errors_do_not_grow_for_what_is_noise(view: View) -> None:
     particles, covariance = np.array([[0.0, 0.0, 3.0, 1e5]]), np.eye(4)[np.newaxis]
-    known = [search.grown(view, particles, covariance, 0.2, alike)[0, 2, 2] for alike in (0.0, 0.1, 0.2, 1.0)]
+    known = [stated.grown(view, particles, covariance, 0.2, alike)[0, 2, 2] for alike in (0.0, 0.1, 0.2, 1.0)]
     assert known[0] == 1.0
     assert 1.0 < known[1] < known[2] == known[3]
 
@@ -287,21 +285,21 @@ def test_variances_grow_with_what_the_best_ones_do_not_leave(rng: np.random.Gene
     # By noise alone chi-squared of 330 pixels scatters by a thirteenth, and nothing is missing.
     noise = rng.chisquare(330, 2000) / 330
     light, known = rng.uniform(0.6, 1.4, noise.size), np.ones(noise.size, np.bool_)
-    assert np.mean(search.missing_light(noise, light, known, 330.0)) < 1.1
+    assert np.mean(stated.missing_light(noise, light, known, 330.0)) < 1.1
     # Nor is it where noise goes with a particle's light: it is as much larger, and no more.
     np.testing.assert_allclose(
-        np.mean(search.missing_light(light * noise, light, known, 330.0) / light), 1.0 / 0.64, rtol=0.1
+        np.mean(stated.missing_light(light * noise, light, known, 330.0) / light), 1.0 / 0.64, rtol=0.1
     )
     # One by itself tells no other reference than 1.
-    assert search.missing_light(np.array([0.9]), np.ones(1), known[:1], 330.0) == pytest.approx(1.0)
+    assert stated.missing_light(np.array([0.9]), np.ones(1), known[:1], 330.0) == pytest.approx(1.0)
     # A root of chi-squared that is twice that of the best ones counts nearly whole.
     twice = 1.0 + 12.0 / 1.15
-    assert search.missing_light(np.array([4.0]), np.ones(1), ~known[:1], 330.0) == pytest.approx(twice, rel=0.1)
+    assert stated.missing_light(np.array([4.0]), np.ones(1), ~known[:1], 330.0) == pytest.approx(twice, rel=0.1)
     # In crowds noise seems four times as large as it is, and 1 is no good particle's chi-squared.
     crowd = np.concatenate([0.25 * noise[:200], rng.lognormal(1.0, 1.5, 800), [0.25, 1.0, 100.0]])
     light, known = rng.uniform(0.6, 1.4, crowd.size), np.arange(crowd.size) < 1000
     light[-3:] = 1.0
-    at_best, at_one, at_hundred = search.missing_light(crowd, light, known, 330.0)[-3:]
+    at_best, at_one, at_hundred = stated.missing_light(crowd, light, known, 330.0)[-3:]
     assert at_best < 1.5
     assert at_one == pytest.approx(twice, rel=0.2)
     assert at_hundred == pytest.approx(1.0 + 19.0 * 12.0, rel=0.2)
@@ -317,7 +315,7 @@ def with_others(view: View, place: tuple[float, ...], light: float, noise: Float
     residual = noise * np.sqrt(variance)
     observation = observation_of(view, residual.copy(), 1.0 / variance, DEPTHS)
     covariance = np.diag(np.square([*SURE_MM, 0.01 * light]))[np.newaxis]
-    found, other = search.with_other_places(observation, particle, covariance, np.ones(1), 0.0)
+    found, other = stated.with_other_places(observation, particle, covariance, np.ones(1), 0.0)
     np.testing.assert_allclose(observation.residual, residual, atol=1e-6)
     return np.sqrt(np.diagonal(found[0])), bool(other[0])
 
@@ -347,14 +345,14 @@ def test_errors_next_to_focus_cover_that_one_may_be_two(view: View, rng: np.rand
     light = TYPICAL * np.array([1.0, 1.2, 1.9, 2.2, 2.2])
     asked = np.column_stack([np.zeros((5, 2)), [0.1, 0.1, 0.1, -0.4, 2.0], light])
     particles, known = np.concatenate([far, asked]), np.ones(45, np.bool_)
-    sigma = np.sqrt(np.diagonal(search.of_two(view, particles, known), axis1=1, axis2=2)) / (0.03, 0.03, 0.53, 1.0)
+    sigma = np.sqrt(np.diagonal(stated.of_two(view, particles, known), axis1=1, axis2=2)) / (0.03, 0.03, 0.53, 1.0)
     # The third part of a lens, and half the depth over which light spreads by one.
     np.testing.assert_allclose(sigma[42:44, :3], 1.0, rtol=0.01)
     assert not sigma[40:42].any()
     # Where many lenses are lit one is no two, and nothing is known of what few tracers' light scatters by.
     assert not sigma[:40].any()
     assert not sigma[44].any()
-    assert not search.of_two(view, asked, known[:5]).any()
+    assert not stated.of_two(view, asked, known[:5]).any()
 
 
 @pytest.mark.thorough
@@ -364,7 +362,7 @@ def test_errors_do_not_grow_for_tracers_lost_elsewhere(table2: Camera, water: Me
     covariance = []
     for shown in (true, true[:1]):
         state = replace(search.rebuilt(task, blank(task), shown), noise=search.noise_with(task, 5e5))
-        covariance.append(search.result(task, state).covariance_mm2[0])
+        covariance.append(stated.result(task, state).covariance_mm2[0])
     # Left alone 0.7 of the light is.
     np.testing.assert_allclose(np.diag(covariance[1]), np.diag(covariance[0]), rtol=0.1)
 
@@ -379,12 +377,12 @@ def test_changes_are_those_of_independent_errors(view: View, monkeypatch: pytest
     def add_all(sized: View, _: object, sign: float, image: Floats, depths: object) -> None:
         image += sign * (3.0 * (2.0 * sized.particle_radius_mm / scene) ** 2 + 5.0 * sized.diffusion_px**2)
 
-    monkeypatch.setattr(search, "with_diffusion", with_diffusion)
-    monkeypatch.setattr(search, "add_all", add_all)
+    monkeypatch.setattr(stated, "with_diffusion", with_diffusion)
+    monkeypatch.setattr(stated, "add_all", add_all)
     covariance = np.array([[4e-4, -1e-4], [-1e-4, 2e-4]])
     for diameter in (0.5, 0.01):
         sized = view._replace(particle_radius_mm=0.5 * diameter * scene, diffusion_px=0.3)
-        changes = search.changes_of_light(sized, np.zeros((0, 4)), covariance, (0.0, 1.0))[:, 0]
+        changes = stated.changes_of_light(sized, np.zeros((0, 4)), covariance, (0.0, 1.0))[:, 0]
         slopes = np.array([3.0, 5.0])
         assert changes @ changes == pytest.approx(slopes @ covariance @ slopes)
 

@@ -26,7 +26,6 @@ from lfpiv_cli.particles.search import (
     SMALLEST_LIGHT,
     SMALLEST_SEEN,
     Fits,
-    Particles,
     State,
     Task,
     blank,
@@ -34,12 +33,12 @@ from lfpiv_cli.particles.search import (
     noise_with,
     observed,
     prune,
-    result,
     sweep,
     usual_light,
     with_measured_noise,
     with_typical_light,
 )
+from lfpiv_cli.particles.stated import Particles, result
 from lfpiv_cli.particles.suspects import good_chi2, with_depths_corrected, with_overlaps_split
 from lfpiv_cli.particles.view import lens_pixels
 

@@ -27,7 +27,8 @@ from lfpiv_cli.optics.tracing import ObjectSpace
 from lfpiv_cli.particles.diameter import UNKNOWN_LENSES, diameter_by
 from lfpiv_cli.particles.refraction import places_by_snell
 from lfpiv_cli.particles.rounds import ROUNDS, after_rounds, find_particles, finished
-from lfpiv_cli.particles.search import Particles, Task, blank, light_left, result, task_of
+from lfpiv_cli.particles.search import Task, blank, task_of
+from lfpiv_cli.particles.stated import Particles, light_left, result
 from lfpiv_cli.particles.view import Light, View, raw_view, with_radius
 from lfpiv_cli.reconstruction.solvers import normalisers
 from lfpiv_cli.self_calibration.nuisances import MovableScene, NuisanceFit, Nuisances, fit_nuisances

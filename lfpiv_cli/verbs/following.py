@@ -18,7 +18,8 @@ from lfpiv_cli.files.weights_file import WeightsFile
 from lfpiv_cli.notice import Notice, warn_of
 from lfpiv_cli.particles.neighbour_frames import Predicted, find_predicted
 from lfpiv_cli.particles.rounds import first_pass
-from lfpiv_cli.particles.search import Particles, blank, rebuilt, result
+from lfpiv_cli.particles.search import blank, rebuilt
+from lfpiv_cli.particles.stated import Particles, result
 from lfpiv_cli.reconstruction.images import Image, light
 from lfpiv_cli.tracks import sequences
 from lfpiv_cli.tracks.candidates import Seen, Trajectories, long_ones

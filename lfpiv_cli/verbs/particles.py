@@ -33,7 +33,8 @@ from lfpiv_cli.particles.diameter import ENOUGH, UNKNOWN_LENSES, diameter_by
 from lfpiv_cli.particles.neighbour_frames import second_frame, second_pass
 from lfpiv_cli.particles.noise import beside_neighbours
 from lfpiv_cli.particles.rounds import ROUNDS, first_pass
-from lfpiv_cli.particles.search import LAST_UNEXPLAINED, MARGIN_DEPTHS, MUCH_LEFT, Particles, Task, result, task_of
+from lfpiv_cli.particles.search import LAST_UNEXPLAINED, MARGIN_DEPTHS, Task, task_of
+from lfpiv_cli.particles.stated import MUCH_LEFT, Particles, result
 from lfpiv_cli.particles.view import Light, View, ensure_square_cells, raw_view
 from lfpiv_cli.reconstruction import images as of_images
 from lfpiv_cli.reconstruction.haze import Haze

@@ -13,7 +13,7 @@ from lfpiv_cli.notice import Notice, written
 from lfpiv_cli.optics.line_responses import USUAL_DIFFUSION_PX
 from lfpiv_cli.particles.camera_light import USUAL_SIGMA_PX
 from lfpiv_cli.particles.diameter import LIMIT_SIGMAS, UNKNOWN_LENSES, Diameter
-from lfpiv_cli.particles.search import MUCH_ALIKE, MUCH_LEFT
+from lfpiv_cli.particles.stated import MUCH_ALIKE, MUCH_LEFT
 from lfpiv_cli.verbs.frames import haze_notices
 
 # More than this share of an image's light, its noise taken off, is too much to leave unexplained.
