@@ -158,7 +158,8 @@ def with_offset_known(task: Task, state: State) -> tuple[Task, State]:
     for _ in range(OFFSET_ROUNDS):
         light = np.maximum(task.light - state.residual, 0.0)
         sigma = np.sqrt(task.read_counts**2 - ROUNDING_COUNTS**2 + state.noise.gain_counts * light)
-        added = mean_whole(light + offset, sigma) - light
+        # Dark pixels are as the dark image has them.
+        added = np.where(light > 0.0, np.maximum(mean_whole(light + offset, sigma), 0.0) - light, 0.0)
         task = replace(task, haze=added if haze is None else haze + added)
         state = rebuilt(task, state, state.particles.copy())
         sweep(task, state, LAST_UNEXPLAINED, LAST_SWEEPS)
