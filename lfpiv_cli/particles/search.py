@@ -110,6 +110,7 @@ class Task:
     light_covariance : (2, 2) of the squares of size and diffusion, see `diffusion`; None: both are right
     haze, haze_error : (rows * columns,) what of the image is smooth over the sensor and no tracer's, and what all
         pixels together may have more of it, standard errors; None: nothing
+    offset_counts : what rounding adds to light, as particles show it; None: not looked for
     """
 
     view: View
@@ -124,6 +125,7 @@ class Task:
     light_covariance: Floats | None = None
     haze: Floats | None = None
     haze_error: Floats | None = None
+    offset_counts: float | None = None
 
     @cached_property
     def light(self) -> Floats:
@@ -213,6 +215,7 @@ def task_of(
     light_covariance : see `Task`
     haze, haze_error : (rows, columns) in the image, and see `Task`; None: nothing
     """
+    in_image, error = (None if light is None else light.astype(np.float64).ravel() for light in (haze, haze_error))
     return Task(
         view,
         weights,
@@ -224,7 +227,8 @@ def task_of(
         _depths_mm(view, *weights.grid.bounds_mm(2)),
         photons_per_count,
         light_covariance,
-        *(None if light is None else light.astype(np.float64).ravel() for light in (haze, haze_error)),
+        in_image,
+        error,
     )
 
 

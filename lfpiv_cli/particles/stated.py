@@ -76,6 +76,7 @@ class Particles:
     left, alike : share of the light that it is where particles light pixels, and of that what is alike in pixels side
         by side, as noise is not
     noise : of the image
+    offset_counts : what rounding adds to light, as the particles show it; None: not looked for
     """
 
     position_mm: Floats
@@ -90,6 +91,7 @@ class Particles:
     left: float
     alike: float
     noise: Noise
+    offset_counts: float | None
 
 
 def missing_light(chi2: Floats, light: Floats, known: NDArray[np.bool_], pixels: float | Floats) -> Floats:
@@ -153,7 +155,7 @@ def with_offset_known(task: Task, state: State) -> tuple[Task, State]:
     uneven = UNEVEN_SHARE * float(np.mean(state.residual[dark])) if dark.any() else 0.0
     before = np.zeros_like(model) if task.haze_error is None else task.haze_error
     after = np.sqrt(np.maximum(before**2 - ROUNDING_COUNTS**2, 0.0) + variance + uneven**2)
-    task = replace(task, haze_error=after)
+    task = replace(task, haze_error=after, offset_counts=offset)
     haze = task.haze
     for _ in range(OFFSET_ROUNDS):
         light = np.maximum(task.light - state.residual, 0.0)
@@ -208,6 +210,7 @@ def result(task: Task, state: State) -> Particles:
         left=share,
         alike=correlation.share,
         noise=state.noise,
+        offset_counts=task.offset_counts,
     )
 
 

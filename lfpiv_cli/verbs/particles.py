@@ -331,6 +331,7 @@ def points_of(bench: Bench, frame: Frame, found: Particles, size: TracerSize, pr
             "beyond_depths": float(np.mean(found.beyond)) if inside.size else 0.0,
         }
         | ({} if haze is None else {"haze_counts": haze.level_counts})
+        | ({} if found.offset_counts is None else {"light_offset_counts": found.offset_counts})
         | ({} if number is None else {"tracers_per_lens": number})
         | ({} if focus is None else {"microlens_focus": focus.off, "microlens_focus_sigma": focus.sigma})
         | size.attributes(),
