@@ -339,7 +339,7 @@ def _by_place(along: Along, gain: float) -> float:
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
 def _turn(along: Along, gain: float) -> float:
-    """Return how it changes with the ball's depth, of (X - x)."""
+    """Return how what a lens is off the ball, as a pixel sees it, changes with the ball's depth, of (X - x)."""
     return along.slope * (along.stretch - gain * along.lever / along.scale)
 
 

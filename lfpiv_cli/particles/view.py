@@ -187,9 +187,12 @@ def raw_view(
     lattice = camera.lattice
     scale = camera.scale(media)
     radius = max(particle_radius_mm, SMALLEST_RADIUS_LENSES * scale.lens_mm)
-    basis = lattice.basis
-    along_axes = 0.5 * np.sum(basis**2, axis=1) / np.diagonal(basis)
-    half_x, half_y = along_axes if lattice.layout == "square" else 2 * (cell_radius(lattice),)
+    half_x = half_y = cell_radius(lattice)
+    lean_x = lean_y = 0.0
+    if lattice.layout == "square":
+        one, other = lattice.basis
+        half_x, half_y = 0.5 * (one @ one) / one[0], 0.5 * (other @ other) / other[1]
+        lean_x, lean_y = one[1] / one[0], other[0] / other[1]
     bent_mm = 0.0 if plane.straight else refraction_error_mm(camera, media, plane.window, np.zeros(1))
     shares = NO_SHARES
     if lattice.layout != "square" or (light is None and bent_mm > BENT_FAR * lattice.pitch.min()):
@@ -202,8 +205,8 @@ def raw_view(
         faces=space.for_kernels(camera) if isinstance(space, CurvedSpace) else NO_FACES,
         half_x_mm=float(half_x),
         half_y_mm=float(half_y),
-        lean_x=float(basis[0, 1] / basis[0, 0]),
-        lean_y=float(basis[1, 0] / basis[1, 1]),
+        lean_x=float(lean_x),
+        lean_y=float(lean_y),
         corner_mm=cell_radius(lattice),
         cell_reach=0.5 if lattice.layout == "square" else 2.0 / 3.0,
         cell_table=shares.table,
