@@ -119,6 +119,17 @@ def test_light_that_is_rounded_shows_where_dark_is(
 
 
 @pytest.mark.thorough
+def test_what_is_left_without_light_is_no_particle(table2: Camera, water: Media, tracers: Floats) -> None:
+    """Of a particle without light no place is known: it ended the search with a matrix that is singular."""
+    camera, grid = replace(table2, columns=500, rows=420), Grid.centred((20, 16, 20), (0.1, 0.1, 0.1), (0.0, 0.0, 1.9))
+    true = tracers[:3] * (1.0, 1.0, 1.0, 0.008)
+    task = task_of_image(np.rint(seen_by(camera, water, true, grid.bounds_mm(2))), camera, water, grid)
+    ghost = np.concatenate([true, [[0.9, 0.7, 2.0, 0.0]]])
+    state = replace(rebuilt(task, blank(task), ghost), typical_light=4e3, noise=noise_with(task, 4e3))
+    assert len(result(task, state).position_mm) == 3
+
+
+@pytest.mark.thorough
 def test_sweeps_end_where_those_over_all_end(task: Task, tracers: Floats) -> None:
     every, some = begun(task, tracers), begun(task, tracers)
     for _ in range(6):

@@ -27,6 +27,7 @@ from lfpiv_cli.particles.search import (
     disturbance,
     observed,
     overlaps_of,
+    prune,
     rebuilt,
     sweep,
     with_measured_noise,
@@ -166,7 +167,8 @@ def with_offset_known(task: Task, state: State) -> tuple[Task, State]:
         state = rebuilt(task, state, state.particles.copy())
         sweep(task, state, LAST_UNEXPLAINED, LAST_SWEEPS)
         state = with_measured_noise(task, state, rims=True)
-    return task, state
+    # With less light a particle may have none left.
+    return task, prune(task, state, 0.0, LAST_UNEXPLAINED)[0]
 
 
 def result(task: Task, state: State) -> Particles:
