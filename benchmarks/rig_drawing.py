@@ -41,6 +41,7 @@ DEPTH_UNITS, DEEPEST = (3.0, 8.0), 0.35
 # Share of the field that the volume fills: at the sensor's rim a tracer is seen from one side only.
 FILLED = 0.8
 # Rays of each tracer, and of all of an image's: where tracers are many, neighbours cost more accuracy than rays' noise.
+# Of brighter ones as many more as their photons ask for, up to so many for an image.
 RAYS, ALL_RAYS, MOST_RAYS = (8_000, 40_000), 2e7, 1e8
 # Photons of each of a tracer's rays, as far as its light is more than so many counts and this share of full scale. Rays
 # that fill the aperture evenly err where lens images end, by a quarter of what as many photons would: of more light

@@ -194,11 +194,11 @@ def experiment(rig: DrawnRig, folder: Path, outcome: Outcome, volumes: bool) -> 
     true.write_text(yaml.safe_dump(rig.true))
     reported.write_text(yaml.safe_dump(rig.reported))
     photograph_white(true, images)
-    simulated = {"board": true} if rig.board else {}
-    simulated["particles"] = folder / "finer.yaml" if rig.haze else true
+    tracers = true
     if rig.haze:
-        simulated["particles"].write_text(yaml.safe_dump(recorded_finer(rig.true)))
-    for what, settings in simulated.items():
+        tracers = folder / "finer.yaml"
+        tracers.write_text(yaml.safe_dump(recorded_finer(rig.true)))
+    for what, settings in (("board", true), ("particles", tracers)) if rig.board else (("particles", tracers),):
         step = run_command("simulate", what, settings, "-o", images)
         if step.exit_code:
             outcome.steps.append(step)
@@ -288,12 +288,9 @@ def recorded_finer(true: dict[str, Any]) -> dict[str, Any]:
     """Return a rig whose counts are those of the finest sensor, for light that is added before they are rounded."""
     scene = true["simulation"]
     finer = 2.0 ** (FINEST_BITS - scene["bits"])
-    counts = {name: finer * scene[f"{name}_counts"] for name in ("particle", "read_noise", "dark_level")}
-    return true | {
-        "simulation": scene
-        | {f"{name}_counts": value for name, value in counts.items()}
-        | {"photons_per_count": scene["photons_per_count"] / finer, "bits": FINEST_BITS}
-    }
+    counts = {key: finer * scene[key] for key in ("particle_counts", "read_noise_counts", "dark_level_counts")}
+    photons = {"photons_per_count": scene["photons_per_count"] / finer}
+    return true | {"simulation": scene | counts | photons | {"bits": FINEST_BITS}}
 
 
 def veil(images: Path, rig: DrawnRig) -> None:

@@ -151,7 +151,7 @@ def measured_noise(
     ----------
     model, residual, usable : (pixels,)
     noise : taken for the read noise, and as it is where too little is lit
-    rims : whether edges of lens images are told apart; in crowds light that was not found looks like theirs
+    rims : whether edges of lens images have noise of their own; in crowds light that was not found looks like theirs
     """
     lit = np.flatnonzero(usable & (model > LIT_SIGMAS * noise.read_counts))
     lit = lit[:: max(lit.size // ENOUGH_PIXELS, 1)]

@@ -54,7 +54,7 @@ LEAST_SEEN = 0.5
 # are too small by 0.002, 0.0008 and 0.0002 in the mean over places, of 0.3 by 0.0008, 0.0002 and 0.00005.
 RIM_SHARE, RIM_PIXELS, RIM_LENSES = 4.0e-3, 64.0, 0.1
 # Counts are coarse where noise is this at most: 0.3 that is rounded, in an image and its dark one. Light above so many
-# is rounded up as often as down. Haze too faint to be told from none is uneven by this share. How light of about a
+# is rounded up as often as down. Haze too faint to be certain is uneven by this share. How light of about a
 # count is rounded follows from where particles are, and these from that: after so many rounds their errors are noise's.
 COARSE_COUNTS, LIT_COUNTS, UNEVEN_SHARE, OFFSET_ROUNDS = 0.6, 4.0, 0.3, 2
 
@@ -142,9 +142,10 @@ def with_offset_known(task: Task, state: State) -> tuple[Task, State]:
     With little noise a dark level between two counts is recorded as one of them, and where light varies from pixel to
     pixel as either: all light is up to half a count off, and no dark pixel shows it.
     """
+    if task.read_counts > COARSE_COUNTS or not len(state.particles):
+        return task, state
     image = task.image[task.usable]
-    whole = 2 * np.count_nonzero(image == np.rint(image)) > image.size
-    if task.read_counts > COARSE_COUNTS or not whole or not len(state.particles):
+    if 2 * np.count_nonzero(image == np.rint(image)) <= image.size:
         return task, state
     model, observation = task.light - state.residual, observed(task, state, LAST_UNEXPLAINED)
     lit = observation._replace(weight=np.where(model > LIT_COUNTS, observation.weight, 0.0))
@@ -293,7 +294,7 @@ NEAR_DEPTHS, OTHER_DEPTHS = 0.9, np.array([-0.6, 0.0, 0.6])
 # Steps of each of these fits.
 OTHER_STEPS = 6
 # Another place is one beyond so many stated errors, squared, where chi-squared rises by less than half of what they
-# let expect, and by so much at most: it is one in twenty that the particle is there.
+# predict, and by so much at most: it is one in twenty that the particle is there.
 ELSEWHERE_SIGMAS2, LARGEST_RISE = 4.0, 6.0
 
 
