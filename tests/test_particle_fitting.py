@@ -25,7 +25,7 @@ from lfpiv_cli.particles.noise import (
     read_noise,
 )
 from lfpiv_cli.particles.suspects import split, try_other_depths
-from lfpiv_cli.particles.view import Light, View, entry_capacity, raw_view, tiles_of, with_radius
+from lfpiv_cli.particles.view import Light, View, entry_capacity, lens_numbers, raw_view, tiles_of, with_radius
 from lfpiv_cli.self_calibration.nuisances import Nuisances, fit_nuisances
 from tests.particle_images import light_on
 from tests.particle_twin import respond_once, twin_image
@@ -305,6 +305,51 @@ def test_errors_that_are_alike_widen_a_particles(view: View) -> None:
         found = stated(view, particle, Correlation(0.2, 0.8), worse)[0]
         np.testing.assert_allclose(np.diag(found), np.diag(moved_by @ law @ moved_by.T), rtol=5e-3)
         assert found[2, 2] > 1.5 * np.linalg.inv(whitened @ whitened.T)[2, 2]
+
+
+@pytest.mark.thorough
+def test_errors_are_those_that_lenses_show(view: View, rng: np.random.Generator) -> None:
+    particles = np.array([[0.20, 0.10, 2.5, 5e5], [0.22, 0.11, 2.7, 4e5]])
+    clean, jacobian, lens = image_of(view, particles), slopes_of(view, particles), lens_numbers(view).ravel()
+    weight = 1.0 / (clean + 36.0)
+    residual = clean * rng.normal(0.0, 0.05, lens.max() + 1)[lens]
+    inverse = np.linalg.inv((jacobian * weight) @ jacobian.T)
+    moved_by = inverse[:4] @ (jacobian * np.sqrt(weight))
+    expected = np.zeros(4)
+    for number in np.unique(lens[jacobian.any(axis=0)]):
+        inside = lens == number
+        moves, slopes = moved_by[:, inside], (jacobian * np.sqrt(weight))[:, inside]
+        tie = moves @ slopes.T
+        taken = np.einsum("ai,ij,aj->a", tie, inverse, tie) / np.sum(moves**2, axis=1)
+        expected += (moves @ (residual * np.sqrt(weight))[inside] / np.maximum(1.0 - taken, 0.25)) ** 2
+    growth = np.mean((expected / np.diag(inverse)[:4])[:3])
+    assert growth > 5.0
+    found = joint_covariance(observed(view, residual, weight), particles, WHITE, np.ones(2))
+    # Slopes of lenses that share profiles are off by up to a hundredth, and its neighbour's own pixels do not count.
+    np.testing.assert_allclose(np.diag(found[0]), growth * np.diag(inverse)[:4], rtol=0.05)
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("uneven", [0.0, 0.05])
+def test_stated_errors_cover_what_is_alike_within_a_lens(view: View, rng: np.random.Generator, uneven: float) -> None:
+    true, lens = scattered(60, rng) * (1.0, 1.0, 0.5, 1.0) + (0.0, 0.0, 2.2, 0.0), lens_numbers(view).ravel()
+    covered, blind = [], []
+    for particle in true[:, np.newaxis]:
+        clean = image_of(view, particle)
+        weight = 1.0 / (clean + 36.0)
+        wrong = clean * rng.normal(0.0, uneven, lens.max() + 1)[lens]
+        residual = wrong + rng.normal(0.0, 1.0, clean.size) / np.sqrt(weight)
+        found = particle.copy()
+        for _ in range(3):
+            refine(observed(view, residual, weight), found)
+        covariance = joint_covariance(observed(view, residual, weight), found, WHITE, np.ones(1))
+        error = (found - particle)[0]
+        covered.append(np.abs(error) < 1.96 * np.sqrt(np.diagonal(covariance[0])))
+        blind.append(np.abs(error) < 1.96 * np.sqrt(np.diagonal(stated(view, particle)[0])))
+    # Of many errors 0.92 are covered, 0.97 of noise alone; two standard errors of the share of 180 are allowed.
+    assert 0.88 <= np.mean(np.array(covered)[:, :3]) <= 0.99
+    if uneven:
+        assert np.mean(np.array(blind)[:, :3]) < 0.8
 
 
 @pytest.mark.thorough

@@ -9,6 +9,12 @@ pixels side by side. With H the normal matrix, K = H^-1 J^T W^(1/2) is how far e
 and errors with the correlation R move it by the covariance K R K^T. What a particle's chi-squared exceeds 1 by is not
 noise but such a sign: it counts as errors that are all alike.
 
+What the model of light gets wrong is alike within a lens and other in the next. Each lens moves a particle by what it
+leaves, sum_p K_p r_p over its pixels; these add up to nothing, and the sum of their squares is the variance that errors
+of any kind make which lenses do not share. The more of a lens's errors a fit takes up, the less it leaves to tell them
+by: each is divided by the share that it leaves of white noise (cluster-robust errors, as leaving out one lens after the
+other makes them: Cameron and Miller, J. Human Resources 50, 2015).
+
 Two particles whose light is hardly distinguished may share it otherwise: with I the light of one, d how far they are
 apart and c the covariance of their light, it moves by -c / I^2 d, of second order in what their light is uncertain by.
 
@@ -20,7 +26,10 @@ Axes: image axes, mm; see `fitting`. A particle's unknowns are x, y, z and light
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
+from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.sparse.linalg import lsmr
 
@@ -38,10 +47,31 @@ from lfpiv_cli.particles.normal_equations import (
     normal_matrix,
     rectangle_of,
 )
+from lfpiv_cli.particles.view import lens_numbers
 from lfpiv_cli.threads import blocks, in_threads
 
 # What of a change particles can make is known to this share.
 SMALL_REST = 1e-4
+# Of a lens's errors fits are taken to leave this share at least: of fewer hardly any is there to tell.
+LEAST_LEFT = 0.25
+# What lenses show counts where it exceeds what is stated by more than so many of the standard errors that white noise
+# makes it uncertain by, in the mean over x, y and z: of a few lenses it is hardly known.
+LENS_SIGMAS = 3.0
+
+
+class Leftover(NamedTuple):
+    """What particles leave of an image, and in which lens.
+
+    Attributes
+    ----------
+    error : (pixels,) the residual over its standard error
+    lens : (rows, columns) number of the lens whose image a pixel is in
+    lenses : how many there are
+    """
+
+    error: Floats
+    lens: NDArray[np.int32]
+    lenses: int
 
 
 def joint_covariance(
@@ -60,9 +90,11 @@ def joint_covariance(
     equations = equations_of(observation, particles)
     shared = np.zeros((0, observation.weight.size)) if changes is None else np.sqrt(observation.weight) * changes
     pulls = _pulls(equations.slopes, shared, observation.optics.camera.columns)
+    lens = lens_numbers(observation.optics)
+    rest = Leftover(np.sqrt(observation.weight) * observation.residual, lens, int(lens.max()) + 1)
     result = np.empty_like(equations.alone)
     in_threads(
-        lambda part: _covariances(equations, particles, correlation, chi2, pulls, part.start, result[part]),
+        lambda part: _covariances(equations, particles, correlation, rest, chi2, pulls, part.start, result[part]),
         blocks(len(particles), BLOCK),
     )
     return result
@@ -109,6 +141,7 @@ def _covariances(
     equations: Equations,
     particles: Floats,
     correlation: Correlation,
+    rest: Leftover,
     chi2: Floats,
     pulls: Floats,
     first: int,
@@ -118,7 +151,7 @@ def _covariances(
 
     Each is the particle's part of the inverse of the normal matrix of itself and its strongest neighbours.
     """
-    room = np.empty(0)
+    room, places = np.empty(0), np.full((2, rest.lenses), -1)
     for k in range(result.shape[0]):
         n = first + k
         members = most_tied(equations, n)
@@ -128,23 +161,23 @@ def _covariances(
         for i in range(scale.size):
             scale[i] = 1.0 / np.sqrt(whole[i, i])
         _rescale(whole, scale)
-        inverse = _first_columns(whole)
+        lower = np.empty_like(whole)
+        inverse = _first_columns(whole, lower)
         _rescale(inverse, scale)
         excess = max(chi2[n] - 1.0, 0.0)
         for a in range(UNKNOWNS):
             for b in range(UNKNOWNS):
                 result[k, a, b] = (1.0 + excess) * inverse[a, b]
-        if correlation.share + excess > 0.0:
-            top, left, rows, columns = rectangle_of(equations.slopes, n)
-            # Large arrays take long to make.
-            if room.size < rows * columns * UNKNOWNS:
-                room = np.empty(rows * columns * UNKNOWNS)
-            moved_by = room[: rows * columns * UNKNOWNS].reshape(rows, columns, UNKNOWNS)
-            moved_by[:] = 0.0
-            for m in range(members.size):
-                of_m = inverse[:, UNKNOWNS * m : UNKNOWNS * (m + 1)]
-                _add_moves(equations.slopes, members[m], of_m, top, left, moved_by)
-            _add_excess(moved_by, correlation.decay, correlation.share + excess, result[k])
+        top, left, rows, columns = rectangle_of(equations.slopes, n)
+        # Large arrays take long to make.
+        if room.size < rows * columns * UNKNOWNS:
+            room = np.empty(rows * columns * UNKNOWNS)
+        moved_by = room[: rows * columns * UNKNOWNS].reshape(rows, columns, UNKNOWNS)
+        moved_by[:] = 0.0
+        for m in range(members.size):
+            of_m = inverse[:, UNKNOWNS * m : UNKNOWNS * (m + 1)]
+            _add_moves(equations.slopes, members[m], of_m, top, left, moved_by)
+        _add_excess(moved_by, correlation.decay, correlation.share + excess, result[k])
         # Light that one particle has and may be another's takes its place along, which slopes do not show.
         for m in range(1, members.size):
             taken = min(max(-inverse[3, UNKNOWNS * m + 3], 0.0) / particles[n, 3] ** 2, 1.0)
@@ -162,13 +195,86 @@ def _covariances(
             for a in range(UNKNOWNS):
                 for b in range(UNKNOWNS):
                     result[k, a, b] += moved[a] * moved[b]
+        on_pixels = (moved_by, (top, left), rest, places)
+        result[k] *= _shown_by_lenses(equations.slopes, members, (lower, scale), *on_pixels, result[k])
 
 
 @njit(cache=True)
-def _first_columns(matrix: Floats) -> Floats:
-    """Return the first columns of a matrix's inverse as rows (4, n); not numbers where it is not positive definite."""
+def _shown_by_lenses(
+    slopes: Slopes,
+    members: NDArray[np.int64],
+    matrix: tuple[Floats, Floats],
+    moved_by: Floats,
+    corner: tuple[int, int],
+    rest: Leftover,
+    places: NDArray[np.int64],
+    stated: Floats,
+) -> float:
+    """Return by what factor what lenses leave shows the variance of a place to be larger than stated, or 1.
+
+    Parameters
+    ----------
+    matrix : L (4 members, 4 members) of the members' normal matrix, and what its rows and columns are multiplied by
+    moved_by : (rows, columns, 4) K on the rectangle of pixels that begins at `corner`
+    places : (2, lenses) -1 each, and room for as many numbers
+    stated : (4, 4) covariance
+    """
+    (lower, scale), (top, left), (rows, columns, _), count = matrix, corner, moved_by.shape, 0
+    for i in range(rows):
+        for j in range(columns):
+            lens = rest.lens[top + i, left + j]
+            if moved_by[i, j, 3] != 0.0 and places[0, lens] < 0:
+                places[0, lens], places[1, count] = count, lens
+                count += 1
+    shifts, squares = np.zeros((count, 3)), np.zeros((count, 3))
+    for i in range(rows):
+        for j in range(columns):
+            if moved_by[i, j, 3] != 0.0:
+                place = places[0, rest.lens[top + i, left + j]]
+                error = rest.error[(top + i) * rest.lens.shape[1] + left + j]
+                for a in range(3):
+                    shifts[place, a] += moved_by[i, j, a] * error
+                    squares[place, a] += moved_by[i, j, a] ** 2
+    # What the fit takes up of white noise: of lens c with J_c and K_c, K_c J_c H^-1 J_c^T K_c^T = |L^-1 J_c^T K_c^T|^2.
+    taken = np.zeros((scale.size, 3 * count))
+    for m in range(members.size):
+        for entry in range(slopes.start[members[m]], slopes.start[members[m] + 1]):
+            i, j = slopes.row[entry] - top, slopes.column[entry] - left
+            if 0 <= i < rows and 0 <= j < columns and moved_by[i, j, 3] != 0.0:
+                first = 3 * places[0, rest.lens[top + i, left + j]]
+                for b in range(UNKNOWNS):
+                    slope = scale[UNKNOWNS * m + b] * slopes.slope[entry, b]
+                    for a in range(3):
+                        taken[UNKNOWNS * m + b, first + a] += slope * moved_by[i, j, a]
+    left_over = squares.copy()
+    for i in range(scale.size):
+        for j in range(i):
+            for k in range(taken.shape[1]):
+                taken[i, k] -= lower[i, j] * taken[j, k]
+        for k in range(taken.shape[1]):
+            taken[i, k] /= lower[i, i]
+            left_over[k // 3, k % 3] -= taken[i, k] ** 2
+    shown = scatter2 = 0.0
+    for a in range(3):
+        whole = fourth = 0.0
+        for place in range(count):
+            square = squares[place, a]
+            if square > 0.0:
+                shift = shifts[place, a] / max(left_over[place, a] / square, LEAST_LEFT)
+                shown += shift * shift / stated[a, a] / 3.0
+                whole, fourth = whole + square, fourth + square * square
+        if whole > 0.0:
+            scatter2 += 2.0 * fourth / whole**2 / 9.0
+    for place in range(count):
+        places[0, places[1, place]] = -1
+    return shown if shown > 1.0 + LENS_SIGMAS * np.sqrt(scatter2) else 1.0
+
+
+@njit(cache=True)
+def _first_columns(matrix: Floats, lower: Floats) -> Floats:
+    """Return the first columns of a matrix's inverse as rows (4, n), and fill its L; NaN if not positive definite."""
     size = matrix.shape[0]
-    lower, one, columns = np.empty((size, size)), np.zeros(size), np.full((UNKNOWNS, size), np.nan)
+    one, columns = np.zeros(size), np.full((UNKNOWNS, size), np.nan)
     if factored(matrix, 0.0, lower):
         for i in range(UNKNOWNS):
             one[i] = 1.0

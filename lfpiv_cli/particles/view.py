@@ -308,6 +308,20 @@ def lens_pixels(view: View) -> float:
     return 4.0 * view.half_x_mm * view.half_y_mm / view.camera.pixel_mm**2
 
 
+def lens_numbers(view: View) -> NDArray[np.int32]:
+    """Return the number of the lens whose image a pixel is in (rows, columns), by the plain lattice.
+
+    On hexagonal arrays cells are taken as rhombs: one pixel in six is its neighbour's.
+    """
+    camera = view.camera
+    per_px = camera.pixel_mm / (1.0 + camera.microlens_distance_mm / camera.image_distance_mm)
+    x = (np.arange(camera.columns) - 0.5 * (camera.columns - 1)) * per_px - camera.origin_mm[0]
+    y = (np.arange(camera.rows)[:, np.newaxis] - 0.5 * (camera.rows - 1)) * per_px - camera.origin_mm[1]
+    i, j = (np.rint(x * ways[0] + y * ways[1]).astype(np.int32) for ways in view.inverse_basis.T)
+    i, j = i - i.min(), j - j.min()
+    return np.asarray(j * (i.max() + 1) + i, np.int32)
+
+
 def footprint_radius_mm(view: View, points: Floats) -> Floats:
     """Return how far (n,) on the array the light of particles (n, 3 or more) spreads from their centres."""
     return np.asarray(_spreads_mm(view, points).max(axis=1))
