@@ -79,7 +79,7 @@ def true_warnings(figures: Figures) -> set[str]:
 
 
 def judge_calibration(rig: DrawnRig, calibration: Path) -> Figures:
-    """Return how far the board's magnification is off, as a share, and its standard error."""
+    """Return how far the board's magnification is off, as a share, and standard errors of it and of its depth."""
     pose = open_calibration(calibration).pose
     true = rig.true["camera"]["main_lens"]["magnification"]
     if pose is None:
@@ -87,6 +87,7 @@ def judge_calibration(rig: DrawnRig, calibration: Path) -> Figures:
     return {
         "magnification_off": pose.magnification / true - 1.0,
         "magnification_sigma": pose.magnification_sigma / abs(true),
+        "depth_sigma": pose.z0_sigma_mm / (DEPTH_VOXEL * rig.depth_mm),
     }
 
 
@@ -150,22 +151,28 @@ def judge_particles(rig: DrawnRig, truth: Truth, particles: Path) -> Figures:
     return figures
 
 
-def judge_tracks(truth: Truth, tracks: Path) -> Figures:
+def offset_mm(rig: DrawnRig, figures: Figures) -> NDArray[np.float64]:
+    """Return how far (3,) all particles lie off together: an error of the calibration, which is judged by itself."""
+    offset = np.array([figures.get(f"offset_{axis}", 0.0) for axis in AXES])
+    return offset * np.array([rig.lens_mm, rig.lens_mm, DEPTH_VOXEL * rig.depth_mm])
+
+
+def judge_tracks(truth: Truth, tracks: Path, offset: NDArray[np.float64]) -> Figures:
     """Return the slopes of measured on true displacements of tracks, by their stated errors, and how sure these are."""
     found = read_points(tracks, TRACKS_FORMAT)
     figures: Figures = {"tracks": float(len(found.position_mm))}
     if len(found.position_mm):
-        true = truth.flow(found.position_mm)
+        true = truth.flow(found.position_mm - offset)
         sigma = found.arrays["velocity_sigma"]
         figures |= _slopes(found.arrays["velocity"], true, np.where(sigma > 0.0, sigma, np.inf))
     return figures
 
 
-def judge_vectors(truth: Truth, vectors: Path, prefix: str) -> Figures:
+def judge_vectors(truth: Truth, vectors: Path, prefix: str, offset: NDArray[np.float64]) -> Figures:
     """Return the slopes of measured on true velocities of windows, and the share that was found."""
     field = open_vectors(vectors)
     z, y, x = np.meshgrid(*(field.grid.axis_mm(axis) for axis in (2, 1, 0)), indexing="ij")
-    true = truth.flow(np.stack([x, y, z], axis=-1).reshape(-1, 3)).reshape(*field.flag.shape, 3)
+    true = truth.flow(np.stack([x, y, z], axis=-1).reshape(-1, 3) - offset).reshape(*field.flag.shape, 3)
     kept = field.flag < REJECTED
     figures: Figures = {f"{prefix}_valid": float(np.mean(kept))}
     if kept.any():

@@ -43,6 +43,7 @@ from benchmarks.rig_judging import (
     judge_particles,
     judge_tracks,
     judge_vectors,
+    offset_mm,
     true_warnings,
     truth_of,
 )
@@ -71,6 +72,8 @@ SMALLEST_TRACKED, SMALLEST_PRECISION = 0.5, 0.5
 WRONG_SLOPE, SMALLEST_RECALL, FEWEST = 0.02, 0.5, 20
 # A magnification is wrong that is off by more, and by more than so many of its standard errors.
 WRONG_MAGNIFICATION, WRONG_SIGMAS = 0.002, 3.0
+# So are depths off together by more voxels, a tenth of the depth of one lens, and standard errors of the board's.
+WRONG_DEPTH = 0.5
 # Tracers are bright where at least this share of them could be told from noise alone.
 BRIGHT_SHARE = 0.5
 
@@ -230,13 +233,15 @@ def experiment(rig: DrawnRig, folder: Path, outcome: Outcome, volumes: bool) -> 
     if done("reconstruct", weights, *pair, *dark, *by_particles):
         particles = [folder / "particles" / f"pair_{name}.vtkhdf" for name in "ab"]
         outcome.figures |= judge_particles(rig, truth, particles[0])
+        offset = offset_mm(rig, outcome.figures)
         if done("track", *particles, "--grid", "-o", folder / "tracks.vtkhdf"):
-            outcome.figures |= judge_tracks(truth, folder / "tracks.vtkhdf")
-            outcome.figures |= judge_vectors(truth, folder / "tracks_grid.vtkhdf", "grid")
+            outcome.figures |= judge_tracks(truth, folder / "tracks.vtkhdf", offset)
+            outcome.figures |= judge_vectors(truth, folder / "tracks_grid.vtkhdf", "grid", offset)
     if volumes and done("reconstruct", weights, *pair, *dark, "-o", folder / "volumes"):
         both = [folder / "volumes" / f"pair_{name}.vtkhdf" for name in "ab"]
         if done("correlate", *both, "-o", folder / "vectors.vtkhdf"):
-            outcome.figures |= judge_vectors(truth, folder / "vectors.vtkhdf", "volumes")
+            offset = offset_mm(rig, outcome.figures)
+            outcome.figures |= judge_vectors(truth, folder / "vectors.vtkhdf", "volumes", offset)
 
 
 def believed(folder: Path) -> str:
@@ -344,6 +349,9 @@ def faults(figures: Figures) -> list[str]:
     staying = figures.get("staying", judged)
     if figures.get("tracks", staying) < SMALLEST_TRACKED * staying:
         wrong.append(f"{figures['tracks']:.0f} tracks of {staying:.0f} tracers found that stay")
+    depth = abs(figures.get("offset_z", 0.0))
+    if judged >= FEWEST and depth > max(WRONG_DEPTH, WRONG_SIGMAS * figures.get("depth_sigma", 0.0)):
+        wrong.append(f"depths {figures['offset_z']:+.2f} voxel")
     for name in "xyz":
         coverage = figures.get(f"coverage_{name}", 1.0)
         if judged >= FEWEST and coverage < SMALLEST_COVERAGE:
@@ -371,7 +379,7 @@ def verdict(outcome: Outcome) -> str:
         figures = outcome.figures
         # Where depths are off so are velocities that change along them.
         off = max(abs(figures.get(f"slope_{u}", 1.0) - 1.0) - 2.0 * figures.get(f"slope_{u}_sigma", 0.0) for u in "uvw")
-        of_it = ("slope", *(f"coverage {axis}" for axis in axes))
+        of_it = ("slope", "depths", *(f"coverage {axis}" for axis in axes))
         by_that = off < share + WRONG_SLOPE and all(fault.startswith(of_it) for fault in outcome.faults)
         if by_that and re.search(said, outcome.believed):
             return "unknown"
