@@ -50,9 +50,10 @@ UNEVENNESS, COOLING = 0.15, 0.7
 # noise the pixels that a tracer lights have much: with 2 standard deviations depths were 8 % too small.
 LEAST_DARK, LEAST_SIGMAS = 0.05, 2.5
 MUCH_DARK, LEAST_SIGMAS_OF_DARK = 0.15, 0.4
-# Of fewer counts rounding leaves nothing or a whole one; a dark level that drifts is that of pixels between the lens
-# images, too. Whole counts are steps: the search begins no finer, and texture is looked at as far as the next count.
-LEAST_COUNTS, STEP_COUNTS, NEXT_COUNT = 0.5, 1.0, 1.1
+# Of fewer counts rounding leaves nothing or a whole one, and two standard errors of what it makes are as much; a dark
+# level that drifts is that of pixels between the lens images, too. Whole counts are steps: the search begins no finer,
+# and texture is looked at as far as the next count.
+LEAST_COUNTS, STEP_COUNTS, NEXT_COUNT = 0.6, 1.0, 1.1
 # Rounding hides so much of the level between lens images, above which haze is (standard error).
 ROUNDING_COUNTS = 0.29
 # Where few pixels lie between lens images haze may be their level's error: it is above this many of it.

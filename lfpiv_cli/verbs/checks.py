@@ -44,8 +44,8 @@ FEW = FEWEST_OF_FIT + 2
 # Of good pairs four in five particles or more are linked; of unrelated images chance links three in ten. Of so many or
 # more, linked four in five, fewer than half are in one good pair of seventeen at most.
 LEAST_LINKED, FEWEST_TO_LINK = 0.5, 4
-# The share of probably wrong links above which vectors of single tracks are in doubt, of half a link at least.
-MOST_WRONG, LEAST_WRONG_LINKS = 0.05, 0.5
+# The share of probably wrong links above which vectors of single tracks are in doubt, of a whole link at least.
+MOST_WRONG, LEAST_WRONG_LINKS = 0.05, 1.0
 # Pulses of one laser differ by less; where they do not, the fainter image has markedly larger errors.
 MOST_UNEQUAL = 1.25
 # Particles' places scatter by one to two stated errors about smooth paths; what is more is the flow's.
