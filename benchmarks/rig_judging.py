@@ -24,6 +24,7 @@ from lfpiv_cli.synthetic.flows import MM_PER_M, Flow, advect
 from lfpiv_cli.synthetic.render import RAYS
 from lfpiv_cli.validation.planning import Bound, cramer_rao_bound, expected_image, pixel_variance, slopes
 from lfpiv_cli.validation.volume import COVERED_SIGMAS, match
+from lfpiv_cli.verbs.checks import MOST_WRONG
 from lfpiv_cli.verbs.simulate import readout_of, real_camera, simulated_reference
 
 Figures = dict[str, float]
@@ -48,7 +49,7 @@ class Truth:
 
     Attributes
     ----------
-    position_mm : (n, 3)
+    position_mm, later_mm : (n, 3) in the first image and in the second
     inside : (n,) which lie in the volume
     stays : (n,) which lie there in the second image, too
     bound : of their places
@@ -57,6 +58,7 @@ class Truth:
     """
 
     position_mm: NDArray[np.float64]
+    later_mm: NDArray[np.float64]
     inside: NDArray[np.bool_]
     stays: NDArray[np.bool_]
     bound: Bound
@@ -67,10 +69,13 @@ class Truth:
 def true_warnings(figures: Figures) -> set[str]:
     """Return the codes of warnings that are true by the figures, of results that are no worse than is allowed.
 
-    That an image shows no tracers, where none lies in the volume; and that light is another than the model's and stated
-    errors may be too small, where errors are beyond both in some direction, of fewer tracers than coverage is asked of.
+    That an image shows no tracers, where none lies in the volume; that links are wrong, where they are; and that light
+    is another than the model's and stated errors may be too small, where errors are beyond both in some direction, of
+    fewer tracers than coverage is asked of.
     """
     true = {"frame-uniform"} if figures.get("tracers") == 0.0 else set()
+    if figures.get("wrong_links", 0.0) > MOST_WRONG:
+        true.add("wrong-links")
     for axis in AXES:
         uncovered = figures.get(f"coverage_{axis}", 1.0) < SMALLEST_COVERAGE
         if uncovered and figures.get(f"over_{axis}", 1.0) > BEYOND_LIGHT:
@@ -104,14 +109,12 @@ def truth_of(settings: Config, images: Path, grid: Grid) -> Truth:
     per_ray = scene.particle_counts / (scene.rays or RAYS)
     bound = cramer_rao_bound(slope, pixel_variance(expected_image(slope, tracers), readout_of(settings), per_ray))
     later = advect(settings.simulated_flow(reference), seeded.positions_mm, 0.5 * DT_S)
-    position = reference.points_from_focal_point(moved)
+    position, after = (reference.points_from_focal_point(places) for places in (moved, later))
     low, high = np.array([grid.bounds_mm(axis) for axis in range(3)]).T
-    inside, stays = (
-        np.all((at >= low) & (at <= high), axis=1) for at in (position, reference.points_from_focal_point(later))
-    )
+    inside, stays = (np.all((at >= low) & (at <= high), axis=1) for at in (position, after))
     with np.errstate(invalid="ignore"):
         certainty = light / np.sqrt(bound.alone[:, 3, 3])
-    return Truth(position, inside, inside & stays, bound, certainty, settings.simulated_flow())
+    return Truth(position, after, inside, inside & stays, bound, certainty, settings.simulated_flow())
 
 
 def judge_particles(rig: DrawnRig, truth: Truth, particles: Path) -> Figures:
@@ -157,14 +160,24 @@ def offset_mm(rig: DrawnRig, figures: Figures) -> NDArray[np.float64]:
     return offset * np.array([rig.lens_mm, rig.lens_mm, DEPTH_VOXEL * rig.depth_mm])
 
 
-def judge_tracks(truth: Truth, tracks: Path, offset: NDArray[np.float64]) -> Figures:
-    """Return the slopes of measured on true displacements of tracks, by their stated errors, and how sure these are."""
+def judge_tracks(rig: DrawnRig, truth: Truth, tracks: Path, offset: NDArray[np.float64]) -> Figures:
+    """Return the slopes of measured on true displacements of tracks, by their stated errors, and how sure these are.
+
+    And the share of links whose ends are no one tracer's.
+    """
     found = read_points(tracks, TRACKS_FORMAT)
     figures: Figures = {"tracks": float(len(found.position_mm))}
     if len(found.position_mm):
         true = truth.flow(found.position_mm - offset)
         sigma = found.arrays["velocity_sigma"]
         figures |= _slopes(found.arrays["velocity"], true, np.where(sigma > 0.0, sigma, np.inf))
+        scale, tracer = 1.0 / np.array([rig.lens_mm, rig.lens_mm, DEPTH_VOXEL * rig.depth_mm]), []
+        for end, there in ((-0.5, truth.position_mm), (0.5, truth.later_mm)):
+            here = found.position_mm - offset + end * found.arrays["displacement_mm"]
+            pairs = match(here * scale, there * scale, 1.0)
+            tracer.append(np.full(len(here), -1))
+            tracer[-1][pairs.found] = pairs.true
+        figures["wrong_links"] = float(np.mean((tracer[0] != tracer[1]) | (tracer[0] < 0)))
     return figures
 
 

@@ -235,7 +235,7 @@ def experiment(rig: DrawnRig, folder: Path, outcome: Outcome, volumes: bool) -> 
         outcome.figures |= judge_particles(rig, truth, particles[0])
         offset = offset_mm(rig, outcome.figures)
         if done("track", *particles, "--grid", "-o", folder / "tracks.vtkhdf"):
-            outcome.figures |= judge_tracks(truth, folder / "tracks.vtkhdf", offset)
+            outcome.figures |= judge_tracks(rig, truth, folder / "tracks.vtkhdf", offset)
             outcome.figures |= judge_vectors(truth, folder / "tracks_grid.vtkhdf", "grid", offset)
     if volumes and done("reconstruct", weights, *pair, *dark, "-o", folder / "volumes"):
         both = [folder / "volumes" / f"pair_{name}.vtkhdf" for name in "ab"]
