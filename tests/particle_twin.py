@@ -2,9 +2,9 @@
 
 Seen from a pixel's patch of the main lens, the share P(X) of the ball whose light falls into the lens's cell is, along
 each axis of a square cell, a difference of two of the ball's marginal distributions (cubics); mean and slope of P over
-the patch come from a three-point Gauss rule, and the two axes are joined by the patch's covered share and its first
-moments (`covered_share`). Where the array is turned each row of pixels has a profile of its own along x, moved by how
-far up in the cell it sees the ball, and each column one along y.
+the patch come from a three-point Gauss rule on each of its parts, and the two axes are joined by the patch's covered
+share and its first moments (`covered_share`). Where the array is turned each row of pixels has a profile of its own
+along x, moved by how far up in the cell it sees the ball, and each column one along y.
 
 Axes: image axes, mm; see `particles.view`. An *entry* is the meeting of a pixel with one lens; a pixel between two
 micro-images can have two.
@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from lfpiv_cli.arrays import Floats
 from lfpiv_cli.particles import response
 from lfpiv_cli.particles.cells import covered_share
-from lfpiv_cli.particles.micro_images import GAUSS_AT, GAUSS_WEIGHT, LONGEST, SMALLEST_SHARE
+from lfpiv_cli.particles.micro_images import GAUSS_AT, GAUSS_WEIGHT, LONGEST, SMALLEST_SHARE, parts_of
 from lfpiv_cli.particles.refraction import Bend, bend_of, displaced, is_seen
 from lfpiv_cli.particles.response import Along, Bent, Projection, bent_at, join_cell, lenses_of, lit_pixels, mean_width
 from lfpiv_cli.particles.view import View, entry_capacity
@@ -153,12 +153,13 @@ def _fill(view: View, along: Along, bent: tuple[float, float], s: float, lit: tu
     at, gain = along.at + bent[0], stretch * along.alpha + bent[1]
     first, count = lit
     width = camera.pixel_mm / scale
+    parts = parts_of(gain * width / radius)
     for k in range(count):
         middle = _patch(view, along, s, first + k)
         out[:, k] = 0.0
         out[PATCH, k] = middle
-        for node in range(3):
-            xi = GAUSS_AT[node]
+        for node in range(3 * parts):
+            xi = (2 * (node // 3) + 1 + GAUSS_AT[node % 3]) / parts - 1.0
             # X of the node, its derivatives, and those of u, the array point relative to the lens.
             place = middle + 0.5 * abs(width) * xi
             place_x, place_z = lever * beta / scale, lever * slope * (x - place) / scale
@@ -170,7 +171,7 @@ def _fill(view: View, along: Along, bent: tuple[float, float], s: float, lit: tu
             dense_upper, dense_lower = ball_density(upper), ball_density(lower)
             by_u = (dense_upper - dense_lower) / radius
             by_z = by_u * u_z - (dense_upper * upper - dense_lower * lower) * growth
-            weight = GAUSS_WEIGHT[node]
+            weight = GAUSS_WEIGHT[node % 3] / parts
             out[MEAN, k] += weight * share
             out[SLOPE, k] += 3.0 * weight * xi * share
             out[MEAN_X, k] += weight * by_u * u_x
