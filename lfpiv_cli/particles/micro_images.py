@@ -197,7 +197,7 @@ def fill_profile(out: Singles, count: int, numbers: tuple[Real, ...]) -> None:
 @njit(**VECTORISED)
 def parts_of(side: Real) -> int:
     """Return into how many parts a patch is cut whose side on the array is so many radii of the ball."""
-    return max(int(np.ceil(abs(side) / WIDEST_PART)), 1)
+    return max(int(np.ceil(np.abs(side) / WIDEST_PART)), 1)
 
 
 class Line(NamedTuple):
