@@ -421,8 +421,8 @@ def told_of(**measured: object) -> list[Notice]:
         ({"particles_per_lens": 0.0}, None, ""),
         ({"particles_per_lens": 1.99}, None, ""),
         ({"particles_per_lens": 2.01}, "particles-crowded", "2.01 particles for each microlens, at most 2"),
-        ({"per_lens_in_focus": 1.19}, None, ""),
-        ({"per_lens_in_focus": 1.21}, "particles-crowded", "focal plane 1.21 particles light each microlens, at most"),
+        ({"per_lens_in_focus": 1.49}, None, ""),
+        ({"per_lens_in_focus": 1.51}, "particles-crowded", "focal plane 1.51 particles light each microlens, at most"),
         # Few were found of those that were counted.
         ({"particles_per_lens": 1.2, "tracers_per_lens": 1.9}, None, ""),
         ({"particles_per_lens": 1.2, "tracers_per_lens": 4.0}, "particles-crowded", "4 particles for each microlens, "),

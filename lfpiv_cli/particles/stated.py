@@ -49,10 +49,9 @@ PLAIN_CHI2 = 3.0
 # Particles of which so much is seen tell what fits best.
 LEAST_SEEN = 0.5
 # Pixels at the rim of lens images are lit in part, which the model of light by rays knows to first order. Of tracers of
-# up to this radius, in lenses, depths are wrong by this share at most where a lens has so many pixels, and by less the
-# larger tracers are and by its square the more pixels there are: of a tenth of a lens and 64, 144 and 400 pixels depths
-# are too small by 0.002, 0.0008 and 0.0002 in the mean over places, of 0.3 by 0.0008, 0.0002 and 0.00005.
-RIM_SHARE, RIM_PIXELS, RIM_LENSES = 4.0e-3, 64.0, 0.1
+# up to this radius, in lenses, depths are wrong by this share where a lens has so many pixels, and by less the larger
+# tracers are and by its square the more pixels there are: of 16 single bright ones by 0.0015, rms.
+RIM_SHARE, RIM_PIXELS, RIM_LENSES = 1.8e-3, 64.0, 0.1
 # Counts are coarse where noise is this at most: 0.3 that is rounded, in an image and its dark one. Light above so many
 # is rounded up as often as down. Haze too faint to be certain is uneven by this share. How light of about a
 # count is rounded follows from where particles are, and these from that: after so many rounds their errors are noise's.
@@ -131,7 +130,7 @@ def missing_around(view: View, particles: Floats, chi2: Floats, known: NDArray[n
 
 
 def rim_error(view: View) -> float:
-    """Return by what share of their depths particles are wrong where lens images are few pixels wide, at most."""
+    """Return by what share of their depths particles are wrong where lens images are few pixels wide."""
     larger = max(view.particle_radius_mm / (RIM_LENSES * view.scale.lens_mm), 1.0)
     return RIM_SHARE / larger * (RIM_PIXELS / lens_pixels(view)) ** 2
 
