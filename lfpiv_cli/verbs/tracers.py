@@ -23,8 +23,8 @@ LARGEST_UNEXPLAINED = 0.2
 # plane 0.65 to 0.7 of their depths are covered. Where hardly any is alike, what is left is noise.
 MUCH_LEFT_ALIKE, LEAST_ALIKE = 0.06, 0.05
 # Of 2 tracers for each microlens .87 to .94 of stated errors are covered and .92 to .96 of what a pair shows are
-# tracers, of 3 .85 of what a frame shows. Of five random rigs whose focal plane holds 1.2 to 1.45 for each microlens .84
-# to .96 are covered, of two that hold 2.8 .77 to .86.
+# tracers, of 3 .85 of what a frame shows. Of five random rigs whose focal plane holds 1.2 to 1.45 for each microlens
+# .84 to .96 are covered, of two that hold 2.8 .77 to .86.
 LARGEST_CROWD, LARGEST_CROWD_IN_FOCUS = 2.0, 1.5
 # Of tracers at all depths of a usual volume one in seven at most has another depth that fits about as well, in crowds.
 MOST_AMBIGUOUS = 0.25
