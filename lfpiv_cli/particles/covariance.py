@@ -219,6 +219,9 @@ def _shown_by_lenses(
     places : (2, lenses) -1 each, and room for as many numbers
     stated : (4, 4) covariance
     """
+    if not stated[0, 0] > 0.0:
+        # Not a number, where the matrix has no L.
+        return 1.0
     (lower, scale), (top, left), (rows, columns, _), count = matrix, corner, moved_by.shape, 0
     for i in range(rows):
         for j in range(columns):
