@@ -92,7 +92,7 @@ def judge_calibration(rig: DrawnRig, calibration: Path) -> Figures:
     return {
         "magnification_off": pose.magnification / true - 1.0,
         "magnification_sigma": pose.magnification_sigma / abs(true),
-        "depth_sigma": pose.z0_sigma_mm / (DEPTH_VOXEL * rig.depth_mm),
+        "depth_sigma": pose.z0_sigma_mm / float(voxel_mm(rig)[2]),
     }
 
 
@@ -117,10 +117,15 @@ def truth_of(settings: Config, images: Path, grid: Grid) -> Truth:
     return Truth(position, after, inside, inside & stays, bound, certainty, settings.simulated_flow())
 
 
+def voxel_mm(rig: DrawnRig) -> NDArray[np.float64]:
+    """Return the lengths (3,) in which places are judged."""
+    return np.array([rig.lens_mm, rig.lens_mm, DEPTH_VOXEL * rig.depth_mm])
+
+
 def judge_particles(rig: DrawnRig, truth: Truth, particles: Path) -> Figures:
     """Return recall, precision, errors over the bound and coverage of the first image's particles."""
     found = read_points(particles, PARTICLES_FORMAT)
-    scale = 1.0 / np.array([rig.lens_mm, rig.lens_mm, DEPTH_VOXEL * rig.depth_mm])
+    scale = 1.0 / voxel_mm(rig)
     figures = {
         "tracers": float(truth.inside.sum()),
         "bright": float(np.mean(truth.light_over_sigma[truth.inside] > BRIGHT)) if truth.inside.any() else 0.0,
@@ -157,7 +162,7 @@ def judge_particles(rig: DrawnRig, truth: Truth, particles: Path) -> Figures:
 def offset_mm(rig: DrawnRig, figures: Figures) -> NDArray[np.float64]:
     """Return how far (3,) all particles lie off together: an error of the calibration, which is judged by itself."""
     offset = np.array([figures.get(f"offset_{axis}", 0.0) for axis in AXES])
-    return offset * np.array([rig.lens_mm, rig.lens_mm, DEPTH_VOXEL * rig.depth_mm])
+    return offset * voxel_mm(rig)
 
 
 def judge_tracks(rig: DrawnRig, truth: Truth, tracks: Path, offset: NDArray[np.float64]) -> Figures:
@@ -171,7 +176,7 @@ def judge_tracks(rig: DrawnRig, truth: Truth, tracks: Path, offset: NDArray[np.f
         true = truth.flow(found.position_mm - offset)
         sigma = found.arrays["velocity_sigma"]
         figures |= _slopes(found.arrays["velocity"], true, np.where(sigma > 0.0, sigma, np.inf))
-        scale, tracer = 1.0 / np.array([rig.lens_mm, rig.lens_mm, DEPTH_VOXEL * rig.depth_mm]), []
+        scale, tracer = 1.0 / voxel_mm(rig), []
         for end, there in ((-0.5, truth.position_mm), (0.5, truth.later_mm)):
             here = found.position_mm - offset + end * found.arrays["displacement_mm"]
             pairs = match(here * scale, there * scale, 1.0)

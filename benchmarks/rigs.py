@@ -230,17 +230,17 @@ def experiment(rig: DrawnRig, folder: Path, outcome: Outcome, volumes: bool) -> 
         return
     pair = (images / "pair_a.tif", images / "pair_b.tif")
     by_particles = ("--solver", "particles", "--pairing", "ab", "-o", folder / "particles")
-    if done("reconstruct", weights, *pair, *dark, *by_particles):
-        particles = [folder / "particles" / f"pair_{name}.vtkhdf" for name in "ab"]
+    particles = [folder / "particles" / f"pair_{name}.vtkhdf" for name in "ab"]
+    found = done("reconstruct", weights, *pair, *dark, *by_particles)
+    if found:
         outcome.figures |= judge_particles(rig, truth, particles[0])
-        offset = offset_mm(rig, outcome.figures)
-        if done("track", *particles, "--grid", "-o", folder / "tracks.vtkhdf"):
-            outcome.figures |= judge_tracks(rig, truth, folder / "tracks.vtkhdf", offset)
-            outcome.figures |= judge_vectors(truth, folder / "tracks_grid.vtkhdf", "grid", offset)
+    offset = offset_mm(rig, outcome.figures)
+    if found and done("track", *particles, "--grid", "-o", folder / "tracks.vtkhdf"):
+        outcome.figures |= judge_tracks(rig, truth, folder / "tracks.vtkhdf", offset)
+        outcome.figures |= judge_vectors(truth, folder / "tracks_grid.vtkhdf", "grid", offset)
     if volumes and done("reconstruct", weights, *pair, *dark, "-o", folder / "volumes"):
         both = [folder / "volumes" / f"pair_{name}.vtkhdf" for name in "ab"]
         if done("correlate", *both, "-o", folder / "vectors.vtkhdf"):
-            offset = offset_mm(rig, outcome.figures)
             outcome.figures |= judge_vectors(truth, folder / "vectors.vtkhdf", "volumes", offset)
 
 

@@ -76,8 +76,8 @@ def test_small_balls_far_from_focus_are_what_rays_make(
     table2: Camera, water: Media, layout: Layout, most: float, depth_mm: float
 ) -> None:
     camera, radius_mm = replace(table2, lattice=Lattice.regular(0.1, layout), columns=320, rows=320), 0.005
-    place, ball = (0.03, 0.02, depth_mm), Balls([(0.03, 0.02, depth_mm)], 1.0, 2 * radius_mm)
-    space = ObjectSpace(water, None, "paraxial")
+    place, space = (0.03, 0.02, depth_mm), ObjectSpace(water, None, "paraxial")
+    ball = Balls([place], 1.0, 2 * radius_mm)
     traced = render_points(camera, space, ball, np.random.default_rng(1), rays=4_000_000).ravel()
     light = rows_image(raw_view(camera, water, radius_mm), place)[:, 0]
     # 0.002 is left, behind hexagons 0.010; a pixel's patch is five times as wide as the ball's radius, and as one part
