@@ -179,9 +179,10 @@ def test_a_claim_is_worth_the_light_that_is_there_and_none_where_pixels_have_no_
     clean = image_of(view, particle)
     weight = np.where(np.arange(clean.size) % view.camera.columns < 330, 1.0, 0.0)
     residual = np.where(weight > 0.0, 0.0, -1e6)  # what stands there must not matter
-    chi2, share, seen = judge(observed(view, residual, weight), particle)
+    chi2, share, brightest, seen = judge(observed(view, residual, weight), particle)
     assert chi2[0] == 0.0
     assert share[0] == 1.0
+    assert brightest[0] == pytest.approx(clean[weight > 0.0].max())
     assert seen[0] == pytest.approx(clean[weight > 0.0].sum() / 2.5e5)
     assert 0.1 < seen[0] < 0.9
 

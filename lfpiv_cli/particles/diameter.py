@@ -473,7 +473,7 @@ def _tried(task: Task, state: State, diameters: NDArray[np.float64], unexplained
     sweep(task, state, unexplained, SWEEPS)
     state = with_typical_light(task, state, judged(task, state, LAST_UNEXPLAINED))
     observation = observed(task, state, unexplained)
-    chi2, _, seen = judge(observation, state.particles)
+    chi2, _, _, seen = judge(observation, state.particles)
     bright = _bright(state, seen)
     good = np.flatnonzero(bright)[np.argsort(chi2[bright], kind="stable")[:MOST_TRACERS]]
     tracers, change = state.particles[good], np.zeros((len(trials), good.size))

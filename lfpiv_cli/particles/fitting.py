@@ -470,26 +470,32 @@ def _add_all(
         add_light(pixels, values, sign * particles[number, 3], image)
 
 
-def judge(observation: Observation, particles: Floats) -> tuple[Floats, Floats, Floats]:
-    """Return local chi-squared, claimed share and share of the light that is seen of each particle.
+def judge(observation: Observation, particles: Floats) -> tuple[Floats, Floats, Floats, Floats]:
+    """Return local chi-squared, claimed share, counts in the brightest pixel and share that is seen of each particle.
 
     Local chi-squared is the mean of w r^2 over the particle's light; 1 for a perfect model. Pixels without weight see
     nothing.
     """
-    chi2, share, seen = (np.zeros(len(particles)) for _ in range(3))
+    chi2, share, brightest, seen = (np.zeros(len(particles)) for _ in range(4))
     # By tiles: neighbours' pixels are still at hand.
     over_tiles(
-        lambda numbers: _judge(observation, particles, numbers, chi2, share, seen),
+        lambda numbers: _judge(observation, particles, numbers, chi2, share, brightest, seen),
         observation.optics,
         particles,
         observation.depths_mm,
     )
-    return chi2, share, seen
+    return chi2, share, brightest, seen
 
 
 @njit(cache=True, nogil=True)
 def _judge(
-    observation: Observation, particles: Floats, numbers: NDArray[np.int64], chi2: Floats, share: Floats, seen: Floats
+    observation: Observation,
+    particles: Floats,
+    numbers: NDArray[np.int64],
+    chi2: Floats,
+    share: Floats,
+    brightest: Floats,
+    seen: Floats,
 ) -> None:
     """Do the work of `judge` for the particles of a tile."""
     residual, weight = observation.residual, observation.weight
@@ -497,13 +503,15 @@ def _judge(
     for number in numbers:
         observation.respond(observation.optics, particles[number : number + 1], responses)
         pixels, values = lit_by(responses, 0)
-        total = squares = 0.0
+        total = squares = most = 0.0
         for k in range(pixels.size):
             f, w = values[0, k], weight[pixels[k]]
             if w > 0.0:
                 total += f
+                most = max(most, f)
                 squares += f * w * residual[pixels[k]] * residual[pixels[k]]
         if total > 0.0:
             chi2[number], seen[number] = squares / total, total
         light = particles[number, 3]
+        brightest[number] = light * most
         share[number] = claimed_share(pixels, values, light, residual, weight, light)

@@ -20,6 +20,7 @@ from lfpiv_cli.particles.least_squares import SMALLEST_GAIN, Observation, observ
 from lfpiv_cli.particles.noise import (
     LEAST_SHARE_OF_LIT,
     PHOTONS_PER_PARTICLE,
+    ROUNDING_COUNTS,
     Noise,
     beside_neighbours,
     measured_noise,
@@ -81,6 +82,9 @@ SMALLEST_LIGHT = 0.3
 # In its pixels a particle is brighter than haze may still be by this many of its standard errors: of 0.2 counts left in
 # a 10-bit image one was found five microlenses wide.
 HAZE_SIGMAS = 2.0
+# Where noise is less than rounding, this makes a count of smooth light here and none there: 75 particles beside two
+# tracers, of haze of half a count. A particle's brightest pixel has more counts there.
+LEAST_OF_QUIET = 1.2
 # A particle stays while at least this much of it meets the sensor.
 SMALLEST_SEEN = 0.1
 # A good particle's chi-squared is the one at this percentile.
@@ -139,6 +143,11 @@ class Task:
         return HAZE_SIGMAS * error * lens_pixels(self.view)
 
     @cached_property
+    def least_brightest(self) -> float:
+        """The counts below which a particle's brightest pixel may be rounding's; 0 where noise hides its steps."""
+        return LEAST_OF_QUIET if self.read_counts <= ROUNDING_COUNTS else 0.0
+
+    @cached_property
     def read_counts(self) -> float:
         """The image's read noise, which every step asks for: of whole counts, which what fills gaps is not."""
         return read_noise(self.image[self.usable])
@@ -149,16 +158,19 @@ class Fits(NamedTuple):
 
     Attributes
     ----------
-    chi2, share, seen : (n,) local chi-squared, claimed share, share of the light that is seen
+    chi2, share : (n,) local chi-squared, claimed share
+    brightest : (n,) counts in the brightest pixel
+    seen : (n,) share of the light that is seen
     """
 
     chi2: Floats
     share: Floats
+    brightest: Floats
     seen: Floats
 
     def of(self, chosen: NDArray[np.bool_]) -> Fits:
         """Return those of some particles."""
-        return Fits(self.chi2[chosen], self.share[chosen], self.seen[chosen])
+        return Fits(*(each[chosen] for each in self))
 
 
 @dataclass(frozen=True, eq=False)
@@ -298,7 +310,7 @@ def prune(task: Task, state: State, claimed_share: float, unexplained: float) ->
     fits = judged(task, state, unexplained)
     least = max(SMALLEST_LIGHT * state.typical_light, task.least_light)
     keep = (state.particles[:, 3] > least) & (fits.seen > SMALLEST_SEEN)
-    keep &= fits.share > claimed_share
+    keep &= (fits.share > claimed_share) & (fits.brightest > task.least_brightest)
     return kept(task, state, keep), fits.of(keep)
 
 

@@ -178,7 +178,7 @@ def result(task: Task, state: State) -> Particles:
     order = np.argsort(-state.particles[:, 3], kind="stable")
     particles = state.particles[order]
     observation = observed(task, state, 0.0)
-    chi2, _, seen = judge(observation, particles)
+    chi2, _, _, seen = judge(observation, particles)
     images = (task.light - state.residual, state.residual, observation.weight)
     model, left, trust = (values.reshape(shape) for values in images)
     correlation = error_correlation(model, left, trust, state.noise)
