@@ -126,6 +126,19 @@ def test_light_that_may_be_haze_is_no_particle(table2: Camera, water: Media, rng
         assert len(first_pass(replace(task, haze_error=error), ROUNDS[:1]).particles) == found
 
 
+@pytest.mark.thorough
+def test_steps_of_light_that_is_rounded_are_no_particles(
+    table2: Camera, water: Media, rng: np.random.Generator
+) -> None:
+    """Of haze of half a count, which a sensor with hardly any noise records as none or one."""
+    camera = replace(table2, columns=160, rows=160)
+    crowd = np.column_stack([rng.uniform((-1.0, -1.0, 1.0), (1.0, 1.0, 2.8), (20_000, 3)), np.ones(20_000)])
+    haze = seen_by(camera, water, crowd, (1.0, 3.0))
+    image = np.rint(0.5 * haze / haze.max() + 0.3 + rng.normal(0.0, 0.1, haze.size))
+    state = first_pass(task_for(image, camera, water, grid_of((10, 10, 7), 1.9)), ROUNDS)
+    assert len(state.particles) == 0
+
+
 def with_noise(light: Floats, rng: np.random.Generator) -> Floats:
     return rng.poisson(0.5 * light) / 0.5 + rng.normal(0.0, 6.0, light.shape)
 
