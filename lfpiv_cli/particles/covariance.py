@@ -222,7 +222,7 @@ def _shown_by_lenses(
     if not stated[0, 0] > 0.0:
         # Not a number, where the matrix has no L.
         return 1.0
-    (lower, scale), (top, left), (rows, columns, _), count = matrix, corner, moved_by.shape, 0
+    (top, left), (rows, columns, _), count = corner, moved_by.shape, 0
     for i in range(rows):
         for j in range(columns):
             lens = rest.lens[top + i, left + j]
@@ -238,25 +238,7 @@ def _shown_by_lenses(
                 for a in range(3):
                     shifts[place, a] += moved_by[i, j, a] * error
                     squares[place, a] += moved_by[i, j, a] ** 2
-    # What the fit takes up of white noise: of lens c with J_c and K_c, K_c J_c H^-1 J_c^T K_c^T = |L^-1 J_c^T K_c^T|^2.
-    taken = np.zeros((scale.size, 3 * count))
-    for m in range(members.size):
-        for entry in range(slopes.start[members[m]], slopes.start[members[m] + 1]):
-            i, j = slopes.row[entry] - top, slopes.column[entry] - left
-            if 0 <= i < rows and 0 <= j < columns and moved_by[i, j, 3] != 0.0:
-                first = 3 * places[0, rest.lens[top + i, left + j]]
-                for b in range(UNKNOWNS):
-                    slope = scale[UNKNOWNS * m + b] * slopes.slope[entry, b]
-                    for a in range(3):
-                        taken[UNKNOWNS * m + b, first + a] += slope * moved_by[i, j, a]
-    left_over = squares.copy()
-    for i in range(scale.size):
-        for j in range(i):
-            for k in range(taken.shape[1]):
-                taken[i, k] -= lower[i, j] * taken[j, k]
-        for k in range(taken.shape[1]):
-            taken[i, k] /= lower[i, i]
-            left_over[k // 3, k % 3] -= taken[i, k] ** 2
+    left_over = squares - _taken_up(slopes, members, matrix, moved_by, corner, rest.lens, places[0], count)
     shown = scatter2 = 0.0
     for a in range(3):
         whole = fourth = 0.0
@@ -271,6 +253,43 @@ def _shown_by_lenses(
     for place in range(count):
         places[0, places[1, place]] = -1
     return shown if shown > 1.0 + LENS_SIGMAS * np.sqrt(scatter2) else 1.0
+
+
+@njit(cache=True)
+def _taken_up(
+    slopes: Slopes,
+    members: NDArray[np.int64],
+    matrix: tuple[Floats, Floats],
+    moved_by: Floats,
+    corner: tuple[int, int],
+    lens: NDArray[np.int32],
+    places: NDArray[np.int64],
+    count: int,
+) -> Floats:
+    """Return the variance (lenses, 3) by white noise of a place that the fit takes up of each of so many lenses.
+
+    Of lens c with J_c and K_c it is K_c J_c H^-1 J_c^T K_c^T = |L^-1 J_c^T K_c^T|^2. `places` are the lenses' numbers.
+    """
+    (lower, scale), (top, left), (rows, columns, _) = matrix, corner, moved_by.shape
+    carried = np.zeros((scale.size, 3 * count))
+    for m in range(members.size):
+        for entry in range(slopes.start[members[m]], slopes.start[members[m] + 1]):
+            i, j = slopes.row[entry] - top, slopes.column[entry] - left
+            if 0 <= i < rows and 0 <= j < columns and moved_by[i, j, 3] != 0.0:
+                first = 3 * places[lens[top + i, left + j]]
+                for b in range(UNKNOWNS):
+                    slope = scale[UNKNOWNS * m + b] * slopes.slope[entry, b]
+                    for a in range(3):
+                        carried[UNKNOWNS * m + b, first + a] += slope * moved_by[i, j, a]
+    taken = np.zeros((count, 3))
+    for i in range(scale.size):
+        for j in range(i):
+            for k in range(carried.shape[1]):
+                carried[i, k] -= lower[i, j] * carried[j, k]
+        for k in range(carried.shape[1]):
+            carried[i, k] /= lower[i, i]
+            taken[k // 3, k % 3] += carried[i, k] ** 2
+    return taken
 
 
 @njit(cache=True)
