@@ -208,11 +208,11 @@ def searched(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(particles, name, search)
 
 
-def finder(pairing: str, keep_going: bool, bad: int = BAD) -> particles.Finder:
+def finder(pairing: str, keep_going: bool, bad: int = BAD, images: int = 4) -> particles.Finder:
     def read(number: int) -> tuple[Any, Any]:
         if number == bad:
             raise InputError(f"f{number}.tif: is empty")
-        return np.float32(number), np.float32(number)
+        return np.float32(number % images), np.float32(number % images)
 
     beside, first_of = [(1,), (0,), (3,), (2,)], {1: 0, 3: 2}
     if pairing == "sequence":
@@ -245,3 +245,13 @@ def test_those_beside_a_bad_frame_have_a_look_of_their_own(
     if bad == BAD:
         with pytest.raises(InputError, match=r"f2\.tif: is empty"):
             finder(pairing, False).find(3, 3, lambda steps: None)  # type: ignore[arg-type]
+
+
+def test_a_frame_that_is_the_one_beside_it_again_is_told(searched) -> None:
+    find = finder("sequence", False, -1, images=1).find
+    told = [find(number, number, lambda steps: None)[1] for number in range(4)]  # type: ignore[arg-type]
+    assert [[(each.code, each.about) for each in notices] for notices in told] == [
+        *([("frames-alike", f"f{number}")] for number in range(3)),
+        [],
+    ]
+    assert "the pixels of f1" in told[0][0].text

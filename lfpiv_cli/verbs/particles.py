@@ -404,7 +404,7 @@ class Finder:
         self._advance: Progress | None = None
 
     def find(self, number: int, frame: Frame, advance: Progress) -> tuple[Particles, list[Notice]]:
-        """Return the particles of a frame, and which of those beside it did not help.
+        """Return the particles of a frame, and which of those beside it did not help, or are the same image.
 
         Raises
         ------
@@ -424,6 +424,10 @@ class Finder:
                 notices.append(Notice("frame-alone", self.frames[number].stem, text, "mend that one"))
         if not helping:
             return find(self.bench, frame, advance), notices
+        for k in helping:
+            if k > number and np.array_equal(self.read(k)[0], self.read(number)[0]):
+                text = f"has the pixels of {self.frames[k].stem}: both are one and the same image"
+                notices.append(Notice("frames-alike", self.frames[number].stem, text, "check that the images are two"))
         seen = {k: self._first_pass_of(k) for k in sorted((number, *helping))}
         return find_beside(self.bench, frame, seen[number], [seen[k] for k in helping]), notices
 
