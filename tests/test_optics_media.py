@@ -12,7 +12,7 @@ from scipy.optimize import brentq
 from lfpiv_cli.grid import FOCAL_POINT, Grid, Reference
 from lfpiv_cli.neighbourhoods import largest_around, opened, smallest_around, with_neighbours
 from lfpiv_cli.optics import media as of_media
-from lfpiv_cli.optics.camera import Lattice, nearest_point
+from lfpiv_cli.optics.camera import Lattice, nearest_on_grid, nearest_point
 from lfpiv_cli.optics.media import Media, Window, equivalent_object_distance, exact_lateral_mm, fluid_path_to_focus
 from lfpiv_cli.optics.tracing import disc_points, exact_slope, trace, trace_ray
 from tests.known_rays import slopes_equivalent, slopes_exact
@@ -280,6 +280,9 @@ def test_nearest_by_brute_force_and_by_the_kernel(layout, rng):
     assert np.array_equal(lattice.nearest(points), indices[np.argmin(distance, axis=1)])
     found = np.array([nearest_point(x, y, lattice.origin, lattice.basis) for x, y in points[:500]])
     assert found == pytest.approx(lattice.points(lattice.nearest(points[:500])), abs=1e-15)
+    x, y = points[:30, 0], points[:20, 1]
+    on_grid = nearest_on_grid(x.copy(), y.copy(), lattice.origin, lattice.basis)
+    assert np.array_equal(on_grid, lattice.nearest(np.stack(np.meshgrid(x, y), axis=-1)))
 
 
 def test_coordinates_invert_points_that_transformed_and_scaled_lattices_move(layout, rng):

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from lfpiv_cli.arrays import Floats, Integers
 from lfpiv_cli.grid import Scale
@@ -102,16 +102,16 @@ class Lattice:
 
 
 @njit(cache=True)
-def nearest_point(x: float, y: float, origin: Floats, basis: Floats) -> tuple[float, float]:
-    """Return the position of the lattice point nearest to (x, y): `Lattice.nearest` for kernels."""
+def nearest_index(x: float, y: float, origin: Floats, basis: Floats) -> tuple[float, float]:
+    """Return the indices of the lattice point nearest to (x, y): `Lattice.nearest` for kernels."""
     dx = x - origin[0]
     dy = y - origin[1]
     determinant = basis[0, 0] * basis[1, 1] - basis[0, 1] * basis[1, 0]
     i0 = np.rint((dx * basis[1, 1] - dy * basis[1, 0]) / determinant)
     j0 = np.rint((dy * basis[0, 0] - dx * basis[0, 1]) / determinant)
     best = np.inf
-    best_x = 0.0
-    best_y = 0.0
+    best_i = 0.0
+    best_j = 0.0
     for di in (0.0, -1.0, 1.0):
         for dj in (0.0, -1.0, 1.0):
             px = (i0 + di) * basis[0, 0] + (j0 + dj) * basis[1, 0]
@@ -119,9 +119,27 @@ def nearest_point(x: float, y: float, origin: Floats, basis: Floats) -> tuple[fl
             distance2 = (px - dx) ** 2 + (py - dy) ** 2
             if distance2 < best:
                 best = distance2
-                best_x = px
-                best_y = py
-    return origin[0] + best_x, origin[1] + best_y
+                best_i = i0 + di
+                best_j = j0 + dj
+    return best_i, best_j
+
+
+@njit(cache=True)
+def nearest_point(x: float, y: float, origin: Floats, basis: Floats) -> tuple[float, float]:
+    """Return the position of the lattice point nearest to (x, y)."""
+    i, j = nearest_index(x, y, origin, basis)
+    return origin[0] + (i * basis[0, 0] + j * basis[1, 0]), origin[1] + (i * basis[0, 1] + j * basis[1, 1])
+
+
+@njit(cache=True)
+def nearest_on_grid(x: Floats, y: Floats, origin: Floats, basis: Floats) -> NDArray[np.int32]:
+    """Return `Lattice.nearest` (rows, columns, 2) for all places that a grid's columns x and rows y make."""
+    found = np.empty((y.size, x.size, 2), np.int32)
+    for row in range(y.size):
+        for column in range(x.size):
+            i, j = nearest_index(x[column], y[row], origin, basis)
+            found[row, column, 0], found[row, column, 1] = int(i), int(j)
+    return found
 
 
 def undistorted(

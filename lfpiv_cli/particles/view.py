@@ -23,7 +23,7 @@ from lfpiv_cli.arrays import Floats
 from lfpiv_cli.calibration.model import Calibration
 from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.grid import Scale
-from lfpiv_cli.optics.camera import Camera, KernelCamera, Lattice
+from lfpiv_cli.optics.camera import Camera, KernelCamera, Lattice, nearest_on_grid
 from lfpiv_cli.optics.curved_space import CurvedSpace
 from lfpiv_cli.optics.line_responses import NO_LINES, LineResponses, line_responses, of_balls, on_pixels
 from lfpiv_cli.optics.media import Layers, Media
@@ -309,16 +309,12 @@ def lens_pixels(view: View) -> float:
 
 
 def lens_numbers(view: View) -> NDArray[np.int32]:
-    """Return the number of the lens whose image a pixel is in (rows, columns), by the plain lattice.
-
-    On hexagonal arrays cells are taken as rhombs: one pixel in six is its neighbour's.
-    """
+    """Return the number of the lens whose image a pixel is in (rows, columns), by the plain lattice."""
     camera = view.camera
     per_px = camera.pixel_mm / (1.0 + camera.microlens_distance_mm / camera.image_distance_mm)
-    x = (np.arange(camera.columns) - 0.5 * (camera.columns - 1)) * per_px - camera.origin_mm[0]
-    y = (np.arange(camera.rows)[:, np.newaxis] - 0.5 * (camera.rows - 1)) * per_px - camera.origin_mm[1]
-    i, j = (np.rint(x * ways[0] + y * ways[1]).astype(np.int32) for ways in view.inverse_basis.T)
-    i, j = i - i.min(), j - j.min()
+    x, y = ((np.arange(n) - 0.5 * (n - 1)) * per_px for n in (camera.columns, camera.rows))
+    indices = nearest_on_grid(x, y, camera.origin_mm, np.linalg.inv(view.inverse_basis))
+    i, j = (indices - indices.min(axis=(0, 1))).transpose(2, 0, 1)
     return np.asarray(j * (i.max() + 1) + i, np.int32)
 
 

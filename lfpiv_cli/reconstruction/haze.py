@@ -22,11 +22,9 @@ from scipy.ndimage import distance_transform_edt
 
 from lfpiv_cli.arrays import Flags, Floats, Integers, Singles
 from lfpiv_cli.calibration.model import Calibration
-from lfpiv_cli.optics.camera import Lattice
+from lfpiv_cli.optics.camera import Lattice, nearest_on_grid
 from lfpiv_cli.robust import HALF_NORMAL_MEDIAN
 
-# The nearest microlenses of so many rows are sought at once: of all, it would take gigabytes.
-ROWS_AT_ONCE = 64
 # Pixels that get this share of what their lens image's brightest ones do tell of haze: at rims the profile is less
 # certain. The brightest is the usual one of so many lenses along each side, whose resampling rings.
 PLATEAU, ALIKE_LENSES = 0.8, 5
@@ -82,12 +80,8 @@ class Lenses(NamedTuple):
     @classmethod
     def of(cls, lattice_px: Lattice, image_shape: tuple[int, int]) -> Lenses:
         """Return them for an image (rows, columns) on a lattice of lens images (column, row)."""
-        rows, columns = image_shape
-        indices = np.empty((rows, columns, 2), np.int64)
-        for first in range(0, rows, ROWS_AT_ONCE):
-            block = slice(first, min(first + ROWS_AT_ONCE, rows))
-            y, x = np.mgrid[block, 0:columns]
-            indices[block] = lattice_px.nearest(np.stack([x, y], axis=-1))
+        rows, columns = (np.arange(n, dtype=np.float64) for n in image_shape)
+        indices = nearest_on_grid(columns, rows, lattice_px.origin, lattice_px.basis).astype(np.int64)
         least = indices.min(axis=(0, 1))
         indices -= least
         ni, nj = (int(n) + 1 for n in indices.max(axis=(0, 1)))
