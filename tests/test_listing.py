@@ -247,11 +247,11 @@ def test_those_beside_a_bad_frame_have_a_look_of_their_own(
             finder(pairing, False).find(3, 3, lambda steps: None)  # type: ignore[arg-type]
 
 
-def test_a_frame_that_is_the_one_beside_it_again_is_told(searched) -> None:
+def test_a_frame_that_is_the_one_beside_it_again_is_said(searched) -> None:
     find = finder("sequence", False, -1, images=1).find
-    told = [find(number, number, lambda steps: None)[1] for number in range(4)]  # type: ignore[arg-type]
-    assert [[(each.code, each.about) for each in notices] for notices in told] == [
+    reported = [find(number, number, lambda steps: None)[1] for number in range(4)]  # type: ignore[arg-type]
+    assert [[(each.code, each.about) for each in notices] for notices in reported] == [
         *([("frames-alike", f"f{number}")] for number in range(3)),
         [],
     ]
-    assert "the pixels of f1" in told[0][0].text
+    assert "the pixels of f1" in reported[0][0].text
