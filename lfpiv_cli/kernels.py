@@ -19,8 +19,10 @@ from numba.core.registry import CPUDispatcher
 from numba.core.typing.templates import Signature
 
 # For compiled functions that make no arrays: of every array that a function is given, in tuples too, numba counts the
-# references, which takes longer than what a short function does.
-COUNT_NO_REFERENCES = {"_nrt": False}
+# references, which takes longer than what a short function does. One that returns arrays is called by its like alone:
+# others would count down what it has not counted up, and the arrays would be gone while they are in use. One that makes
+# arrays and is called by one that counts none says so.
+COUNT_NO_REFERENCES, COUNT_REFERENCES = {"_nrt": False}, {"_nrt": True}
 
 
 class _Compiled(CPUDispatcher):
@@ -80,4 +82,5 @@ def by_address(kernel: Callable[..., Any], result: types.Type, *arguments: objec
 
 @cache
 def _compiled_for(kernel: Kernel, signature: Signature) -> Any:
-    return cfunc(signature, cache=True)(kernel.py_func)
+    references = {key: kernel.targetoptions[key] for key in COUNT_NO_REFERENCES if key in kernel.targetoptions}
+    return cfunc(signature, cache=True, **references)(kernel.py_func)

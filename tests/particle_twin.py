@@ -17,10 +17,11 @@ from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from lfpiv_cli.arrays import Floats
+from lfpiv_cli.kernels import COUNT_NO_REFERENCES, COUNT_REFERENCES
 from lfpiv_cli.particles import response
 from lfpiv_cli.particles.cells import covered_share
 from lfpiv_cli.particles.micro_images import GAUSS_AT, GAUSS_WEIGHT, LONGEST, SMALLEST_SHARE, parts_of
-from lfpiv_cli.particles.refraction import Bend, bend_of, displaced, is_seen
+from lfpiv_cli.particles.refraction import Bend, Rays, bend_of, displaced, is_seen, room_for_rays
 from lfpiv_cli.particles.response import Along, Bent, Projection, bent_at, join_cell, lenses_of, lit_pixels, mean_width
 from lfpiv_cli.particles.view import View, entry_capacity
 
@@ -74,7 +75,6 @@ def ball_moment(t: float) -> float:
     return 0.1875 * t2 * (2.0 - t2)
 
 
-@njit(cache=True)
 def respond(view: View, x: float, y: float, z: float, pixels: NDArray[np.int32], values: Floats) -> int:
     """Write the entries of a particle of unit light; return their number. Fits use `rows.respond_rows`.
 
@@ -84,7 +84,20 @@ def respond(view: View, x: float, y: float, z: float, pixels: NDArray[np.int32],
     pixels : (capacity,) flat pixel numbers, written
     values : (capacity, 4) light and its derivatives by x, y, z, written
     """
-    bend = bend_of(view, x, y, z)
+    return _respond_to((x, y, z), view, room_for_rays(), pixels, values)
+
+
+@njit(cache=True, **COUNT_NO_REFERENCES)
+def _respond_to(
+    place: tuple[float, float, float], view: View, rays: Rays, pixels: NDArray[np.int32], values: Floats
+) -> int:
+    """Do the work of `respond`."""
+    return _write_entries(view, bend_of(view, place[0], place[1], place[2], rays), pixels, values)
+
+
+@njit(cache=True, **COUNT_REFERENCES)
+def _write_entries(view: View, bend: Bend, pixels: NDArray[np.int32], values: Floats) -> int:
+    """Write the entries of a particle with these rays; return their number."""
     if not is_seen(bend):
         return 0
     projection = response.project(view, bend)

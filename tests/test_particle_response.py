@@ -17,7 +17,7 @@ from lfpiv_cli.particles.cells import cell_shares, covered_share, level_at, shar
 from lfpiv_cli.particles.fitting import add_all, refine
 from lfpiv_cli.particles.least_squares import observation_of
 from lfpiv_cli.particles.noise import Noise, pixel_weights
-from lfpiv_cli.particles.pencil import MEAN_SQUARE, NODES, WEIGHTS, cubic_at, pencil_of
+from lfpiv_cli.particles.pencil import MEAN_SQUARE, NODES, WEIGHTS, cubic_at, room_for_pencil, set_pencil
 from lfpiv_cli.particles.refraction import on_line_of_sight, paraxial_shift, places_by_snell
 from lfpiv_cli.particles.view import View, footprint_radius_mm, on_array_mm, raw_view, tile_side_mm, with_radius
 from lfpiv_cli.synthetic.render import Balls, render_points
@@ -388,8 +388,14 @@ def test_the_line_is_closest_to_the_slopes(pipe_camera: Camera, water: Media) ->
     np.testing.assert_allclose(WEIGHTS @ NODES**6, 5.0 / 64.0, rtol=1e-14)
     space, radius = tube_of(water), pipe_camera.aperture_radius_mm
     crossing = disc_points(2000, radius, np.random.default_rng(2))
+
+    def pencil_of(place):
+        pencil = room_for_pencil()
+        set_pencil(space.for_kernels(pipe_camera), radius, *place, pencil)
+        return pencil
+
     for place in ((0.4, 3.0, 1.0), (-0.3, -4.8, 0.0)):
-        pencil = pencil_of(space.for_kernels(pipe_camera), radius, *place)
+        pencil = pencil_of(place)
         slopes, _ = space.slopes(pipe_camera, np.tile(place, (len(crossing), 1)), crossing)
         straight = (crossing - pencil.line[:, 0]) / pencil.line[:, 1]
         cubic = np.array([[cubic_at(pencil.cubic[k], *each) for k in range(2)] for each in crossing])
@@ -402,10 +408,7 @@ def test_the_line_is_closest_to_the_slopes(pipe_camera: Camera, water: Media) ->
         # Moves of the line are its differences.
         for axis in range(3):
             step = 1e-4 * np.eye(3)[axis]
-            ahead, behind = (
-                pencil_of(space.for_kernels(pipe_camera), radius, *(np.array(place) + sign * step)).line
-                for sign in (1, -1)
-            )
+            ahead, behind = (pencil_of(np.array(place) + sign * step).line for sign in (1, -1))
             np.testing.assert_allclose(pencil.line_moves[:, :, axis], (ahead - behind) / 2e-4, atol=1e-3)
 
 

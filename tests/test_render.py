@@ -9,8 +9,16 @@ from scipy.ndimage import gaussian_filter
 from lfpiv_cli.calibration.board_pose import BoardGeometry
 from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.optics.camera import Camera, Lattice
-from lfpiv_cli.optics.media import Media, Window, fluid_path_to_focus
-from lfpiv_cli.optics.tracing import ObjectSpace, disc_points, exact_slope, slope_polynomial, slope_ratio, trace
+from lfpiv_cli.optics.media import Layers, Media, Window, fluid_path_to_focus
+from lfpiv_cli.optics.tracing import (
+    SLOPE_NODES,
+    ObjectSpace,
+    disc_points,
+    exact_slope,
+    set_slope_polynomial,
+    slope_ratio,
+    trace,
+)
 from lfpiv_cli.synthetic import render
 from lfpiv_cli.synthetic.board import BoardPlacement, dot_centres, render_board
 from lfpiv_cli.synthetic.rays import in_ball
@@ -75,8 +83,10 @@ def test_balls_and_pixels_are_sampled_evenly_and_slopes_obey_snell(rng):
     assert places.var() == pytest.approx(1.0 / 12.0 + 0.25, rel=0.01)
     assert places == pytest.approx(-places[::-1], abs=1e-9)
     layers, indices = np.array([98.0, 2.0, 140.0]), np.array([1.0, 1.49, 1.33])
+    shallower = Layers(np.array([98.0, 2.0, 100.0]), indices)
+    nodes, factors = np.empty((2, SLOPE_NODES))
     for reach in (20.0, 70.0):  # f/4 and a corner; f/1.4
-        nodes, factors = slope_polynomial(reach, layers, indices)
+        set_slope_polynomial(reach, shallower, 40.0, nodes, factors)
         for lateral in np.linspace(0.01, 1.0, 50) * reach:
             exact = exact_slope(lateral, 0.0, layers, indices)[0]
             found = lateral * slope_ratio(lateral**2, nodes, factors)

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lfpiv_cli.arrays import Floats
-from lfpiv_cli.kernels import njit
+from lfpiv_cli.kernels import COUNT_NO_REFERENCES, njit
 
 # Newton's iteration for the exact refraction starts from the paraxial ray and converges quadratically; below f/1.4 and
 # for n < 2 six steps reach 1e-15, the limit only guards against a ray that grazes.
@@ -98,14 +98,15 @@ def object_space_matrix(z_mm: float, window: Window, focus_distance_mm: float, m
     )
 
 
-@njit(cache=True)
-def snell_invariant(lateral_mm: float, thicknesses_mm: Floats, indices: Floats) -> float:
+@njit(cache=True, **COUNT_NO_REFERENCES)
+def snell_invariant(lateral_mm: float, thicknesses_mm: Floats, indices: Floats, deeper_mm: float = 0.0) -> float:
     """Return n sin(angle), the same in all layers, of the ray that moves `lateral_mm` >= 0 sideways through them.
 
-    Solves sum t_i s / sqrt(n_i^2 - s^2) = lateral by Newton's method from the paraxial ray. The left side is convex and
-    rises to infinity where s meets the smallest index, so a solution always exists below it.
+    The last layer is by `deeper_mm` thicker. Solves sum t_i s / sqrt(n_i^2 - s^2) = lateral by Newton's method from the
+    paraxial ray. The left side is convex and rises to infinity where s meets the smallest index, so a solution always
+    exists below it.
     """
-    paraxial = 0.0
+    paraxial = deeper_mm / indices[-1]
     smallest = indices[0]
     for i in range(thicknesses_mm.size):
         paraxial += thicknesses_mm[i] / indices[i]
@@ -117,8 +118,9 @@ def snell_invariant(lateral_mm: float, thicknesses_mm: Floats, indices: Floats) 
         for i in range(thicknesses_mm.size):
             cosine2 = indices[i] * indices[i] - s * s
             root = np.sqrt(cosine2)
-            value += thicknesses_mm[i] * s / root
-            slope += thicknesses_mm[i] * indices[i] * indices[i] / (cosine2 * root)
+            thickness = thicknesses_mm[i] + (deeper_mm if i == thicknesses_mm.size - 1 else 0.0)
+            value += thickness * s / root
+            slope += thickness * indices[i] * indices[i] / (cosine2 * root)
         step = value / slope
         s = min(max(s - step, 0.0), 0.5 * (s + smallest))
         if abs(step) <= NEWTON_TOLERANCE:

@@ -103,13 +103,18 @@ class Hits:
     valid: Flags
 
 
-@njit(cache=True)
-def exact_slope(dx: float, dy: float, thicknesses_mm: Floats, indices: Floats) -> tuple[float, float]:
-    """Return the slopes in the first layer of the ray that moves (dx, dy) sideways through the layers."""
+@njit(cache=True, **COUNT_NO_REFERENCES)
+def exact_slope(
+    dx: float, dy: float, thicknesses_mm: Floats, indices: Floats, deeper_mm: float = 0.0
+) -> tuple[float, float]:
+    """Return the slopes in the first layer of the ray that moves (dx, dy) sideways through the layers.
+
+    The last of them is by `deeper_mm` thicker.
+    """
     lateral = np.sqrt(dx * dx + dy * dy)
     if lateral == 0.0:
         return 0.0, 0.0
-    invariant = snell_invariant(lateral, thicknesses_mm, indices)
+    invariant = snell_invariant(lateral, thicknesses_mm, indices, deeper_mm)
     tangent = invariant / np.sqrt(indices[0] * indices[0] - invariant * invariant)
     return tangent * dx / lateral, tangent * dy / lateral
 
@@ -298,31 +303,29 @@ class ObjectSpace:
 def _polynomials_at(last_layers_mm: Floats, reach_mm: float, layers: Layers) -> tuple[Floats, Floats]:
     """Return nodes and factors for points behind as much of the last layer as given."""
     nodes, factors = np.empty((last_layers_mm.size, SLOPE_NODES)), np.empty((last_layers_mm.size, SLOPE_NODES))
-    thicknesses = layers.thicknesses_mm.copy()
     for k in range(last_layers_mm.size):
-        thicknesses[-1] = last_layers_mm[k]
-        nodes[k], factors[k] = slope_polynomial(reach_mm, thicknesses, layers.indices)
-    return nodes, factors
-
-
-@njit(cache=True)
-def slope_polynomial(reach_mm: float, layers: Floats, indices: Floats) -> tuple[Floats, Floats]:
-    """Return nodes and divided differences of slope / lateral over lateral^2, up to the lateral distance `reach_mm`."""
-    nodes = np.empty(SLOPE_NODES)
-    factors = np.empty(SLOPE_NODES)
-    for i in range(SLOPE_NODES):
-        nodes[i] = reach_mm**2 * 0.5 * (1.0 - np.cos(np.pi * (i + 0.5) / SLOPE_NODES))
-        lateral = np.sqrt(nodes[i])
-        factors[i] = exact_slope(lateral, 0.0, layers, indices)[0] / lateral
-    for order in range(1, SLOPE_NODES):
-        for i in range(SLOPE_NODES - 1, order - 1, -1):
-            factors[i] = (factors[i] - factors[i - 1]) / (nodes[i] - nodes[i - order])
+        set_slope_polynomial(reach_mm, layers, last_layers_mm[k] - layers.thicknesses_mm[-1], nodes[k], factors[k])
     return nodes, factors
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
+def set_slope_polynomial(reach_mm: float, layers: Layers, deeper_mm: float, nodes: Floats, factors: Floats) -> None:
+    """Fill in nodes and divided differences of slope / lateral over lateral^2, up to the lateral distance `reach_mm`.
+
+    The last layer is by `deeper_mm` thicker.
+    """
+    for i in range(SLOPE_NODES):
+        nodes[i] = reach_mm**2 * 0.5 * (1.0 - np.cos(np.pi * (i + 0.5) / SLOPE_NODES))
+        lateral = np.sqrt(nodes[i])
+        factors[i] = exact_slope(lateral, 0.0, layers.thicknesses_mm, layers.indices, deeper_mm)[0] / lateral
+    for order in range(1, SLOPE_NODES):
+        for i in range(SLOPE_NODES - 1, order - 1, -1):
+            factors[i] = (factors[i] - factors[i - 1]) / (nodes[i] - nodes[i - order])
+
+
+@njit(cache=True, **COUNT_NO_REFERENCES)
 def slope_ratio(lateral2_mm2: float, nodes: Floats, factors: Floats) -> float:
-    """Return slope / lateral distance from `slope_polynomial`."""
+    """Return slope / lateral distance from `set_slope_polynomial`."""
     value = factors[-1]
     for i in range(SLOPE_NODES - 2, -1, -1):
         value = factors[i] + (lateral2_mm2 - nodes[i]) * value

@@ -15,7 +15,7 @@ Axes: image axes, mm; light in counts; residual and weights as flat images. A pa
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numba import void
@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from lfpiv_cli.arrays import Floats, Singles
 from lfpiv_cli.kernels import COUNT_NO_REFERENCES, by_address, njit
 from lfpiv_cli.particles.line_light import VALUES, respond_by_lines
-from lfpiv_cli.particles.refraction import bend_of
+from lfpiv_cli.particles.refraction import Rays, bend_of, room_for_rays
 from lfpiv_cli.particles.rows import SLACK, Scratch, respond_rows, scratch
 from lfpiv_cli.particles.view import LARGEST_MOVE_LENSES, View, by_waves, entry_capacity, type_by_form
 
@@ -55,8 +55,9 @@ class Responses(NamedTuple):
         find common pixels
     common : (2, 4, capacity) where there are two particles, room for what both do to common pixels
     picked : (2, capacity), room for the residual and the weights of the pixels of one of them
+    passed : (capacity,) room for the share of light that reaches these pixels
     began : (1,) what particles added to chi-squared where the last fit began
-    scratch : room for what lenses show
+    rays, scratch : room for a particle's rays, and for what lenses show
     """
 
     counts: NDArray[np.int64]
@@ -65,7 +66,9 @@ class Responses(NamedTuple):
     place: NDArray[np.int32]
     common: Floats
     picked: Floats
+    passed: Singles
     began: Floats
+    rays: Rays
     scratch: Scratch
 
 
@@ -121,7 +124,9 @@ def room_for(members: int, capacity: int, places: int) -> Responses:
     pixels, values = np.empty((members, room), np.int32), np.empty((members, VALUES, room), np.float32)
     common = np.empty((2, UNKNOWNS, room if members == 2 else 0))
     place, picked, began = np.zeros(places, np.int32), np.empty((2, room)), np.zeros(1)
-    return Responses(np.zeros(members, np.int64), pixels, values, place, common, picked, began, scratch(capacity))
+    counts, rays = np.zeros(members, np.int64), room_for_rays()
+    passed = np.empty(room, np.float32)
+    return Responses(counts, pixels, values, place, common, picked, passed, began, rays, scratch(capacity))
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
@@ -139,10 +144,11 @@ def lit_by(responses: Responses, member: int) -> tuple[NDArray[np.int32], Single
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
-def pick(pixels: NDArray[np.int32], image: Floats, picked: Floats) -> None:
+def pick(pixels: NDArray[np.int32], image: NDArray[Any], picked: NDArray[Any]) -> None:
     """Fill in an image's values in some pixels: side by side, sums over them are taken many at once."""
     for k in range(pixels.size):
-        picked[k] = image[pixels[k]]
+        # Without a sign a number is not asked whether it counts from the end.
+        picked[k] = image[np.uint32(pixels[k])]
 
 
 @njit(cache=True, fastmath=SUMS, **COUNT_NO_REFERENCES)
@@ -395,35 +401,39 @@ def respond_of(view: View) -> Respond:
     return respond
 
 
-@njit(cache=True)
+@njit(cache=True, **COUNT_NO_REFERENCES)
 def _respond_by_rays(view: View, members: Floats, responses: Responses) -> None:
     """Write responses by rays."""
     for m in range(members.shape[0]):
         pixels, values = responses.pixels[m], responses.values[m]
-        bend = bend_of(view, members[m, 0], members[m, 1], members[m, 2])
+        bend = bend_of(view, members[m, 0], members[m, 1], members[m, 2], responses.rays)
         responses.counts[m] = respond_rows(view, bend, pixels, values, responses.scratch)
-        _pass(view.passed, pixels[: responses.counts[m]], values)
+        _pass(view.passed, pixels[: responses.counts[m]], values, responses.passed)
 
 
-@njit(cache=True)
+@njit(cache=True, **COUNT_NO_REFERENCES)
 def _respond_by_waves(view: View, members: Floats, responses: Responses) -> None:
     """Write responses by waves."""
     for m in range(members.shape[0]):
         pixels, values = responses.pixels[m], responses.values[m]
-        bend = bend_of(view, members[m, 0], members[m, 1], members[m, 2])
+        bend = bend_of(view, members[m, 0], members[m, 1], members[m, 2], responses.rays)
         responses.counts[m] = respond_by_lines(view, bend, members[m, 2], pixels, values)
-        _pass(view.passed, pixels[: responses.counts[m]], values)
+        _pass(view.passed, pixels[: responses.counts[m]], values, responses.passed)
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
-def _pass(passed: NDArray[np.float32], pixels: NDArray[np.int32], values: Singles) -> None:
-    """Leave of light and its derivatives what reaches the pixels, all where nothing is known of it."""
+def _pass(passed: Singles, pixels: NDArray[np.int32], values: Singles, shares: Singles) -> None:
+    """Leave of light and its derivatives what reaches the pixels, all where nothing is known of it.
+
+    `shares` is room.
+    """
     if passed.size == 0:
         return
-    for k in range(pixels.size):
-        share = passed[pixels[k]]
-        for m in range(UNKNOWNS):
-            values[m, k] *= share
+    pick(pixels, passed, shares)
+    for m in range(UNKNOWNS):
+        light = values[m]
+        for k in range(pixels.size):
+            light[k] *= shares[k]
 
 
 @njit(cache=True, fastmath=SUMS, **COUNT_NO_REFERENCES)

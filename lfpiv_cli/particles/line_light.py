@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lfpiv_cli.kernels import COUNT_NO_REFERENCES, njit
+from lfpiv_cli.kernels import COUNT_NO_REFERENCES, COUNT_REFERENCES, njit
 from lfpiv_cli.optics.line_responses import spline_slopes, spline_weights
 from lfpiv_cli.optics.tracing import slope_ratio
 from lfpiv_cli.particles.refraction import Bend, displaced
@@ -89,7 +89,7 @@ class Room(NamedTuple):
     length: int
 
 
-@njit(cache=True)
+@njit(cache=True, **COUNT_REFERENCES)
 def respond_by_lines(view: View, bend: Bend, z: float, pixels: NDArray[np.int32], values: NDArray[np.float64]) -> int:
     """Write the entries of a particle of unit light at depth z; see `rows.respond_rows`."""
     projection = project(view, bend)

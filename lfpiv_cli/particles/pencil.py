@@ -58,11 +58,13 @@ class Pencil(NamedTuple):
     line : (2, 2) along each image axis place_k and distance_k; all 0 where part of the lens does not see the point
     line_moves : (2, 2, 3) their derivatives by x, y and z
     cubic : (2, TERMS) r_k in mm of X and Y, see `POWERS`
+    slopes : (12, 2) of the rays through the nodes, from which the others follow
     """
 
     line: Floats
     line_moves: Floats
     cubic: Floats
+    slopes: Floats
 
 
 class Aimed(NamedTuple):
@@ -76,22 +78,52 @@ class Aimed(NamedTuple):
 
 
 @njit(cache=True)
-def pencil_of(faces: Faces, radius: float, x: float, y: float, z: float) -> Pencil:
-    """Return the rays of a point over a main lens of that radius."""
-    line, line_moves, cubic = np.zeros((2, 2)), np.zeros((2, 2, 3)), np.zeros((2, TERMS))
-    unseen = Pencil(np.zeros((2, 2)), np.zeros((2, 2, 3)), cubic)
-    slopes = np.empty((WEIGHTS.size, 2))
+def room_for_pencil() -> Pencil:
+    """Return the room for the rays of a point."""
+    return Pencil(np.zeros((2, 2)), np.zeros((2, 2, 3)), np.zeros((2, TERMS)), np.zeros((WEIGHTS.size, 2)))
+
+
+@njit(cache=True, **COUNT_NO_REFERENCES)
+def set_pencil(faces: Faces, radius: float, x: float, y: float, z: float, pencil: Pencil) -> None:
+    """Fill in the rays of a point over a main lens of that radius."""
+    line, line_moves, cubic, slopes = pencil
+    seen = _sum_rays(faces, radius, (x, y, z), pencil) and line[0, 1] > 0.0 and line[1, 1] > 0.0
+    for k in range(2):
+        if seen:
+            _set_cubic(slopes[:, k], radius, line[k, 0], line[k, 1], k, cubic[k])
+            _set_line(line[k], line_moves[k])
+        else:
+            _clear(line[k : k + 1])
+            _clear(line_moves[k])
+            _clear(cubic[k : k + 1])
+
+
+@njit(cache=True, **COUNT_NO_REFERENCES)
+def _clear(values: Floats) -> None:
+    """Fill an array (n, m) with 0."""
+    for row in range(values.shape[0]):
+        for column in range(values.shape[1]):
+            values[row, column] = 0.0
+
+
+@njit(cache=True, **COUNT_NO_REFERENCES)
+def _sum_rays(faces: Faces, radius: float, place: tuple[float, float, float], pencil: Pencil) -> bool:
+    """Fill in the slopes of a point's rays, their means and how they grow over the lens; return whether it is seen."""
+    (x, y, z), (line, line_moves, _, slopes) = place, pencil
+    for k in range(2):
+        _clear(line[k : k + 1])
+        _clear(line_moves[k])
     middle_x, middle_y, there = aim(faces, x, y, z, 0.0, 0.0)
     if not there:
-        return unseen
+        return False
     growth = _growth(faces, middle_x, middle_y, z)
     for n in range(WEIGHTS.size):
         u, v = NODES[n]
         start_x = middle_x + radius * (growth[0] * u + growth[1] * v)
         start_y = middle_y + radius * (growth[2] * u + growth[3] * v)
-        ray = _aimed(faces, (x, y, z), radius * u, radius * v, start_x, start_y)
+        ray = _aimed(faces, place, radius * u, radius * v, start_x, start_y)
         if not ray.there:
-            return unseen
+            return False
         slopes[n, 0], slopes[n, 1] = ray.slope_x, ray.slope_y
         for k in range(2):
             moves = ray.moves_x if k == 0 else ray.moves_y
@@ -101,12 +133,7 @@ def pencil_of(faces: Faces, radius: float, x: float, y: float, z: float) -> Penc
             for j in range(3):
                 line_moves[k, 0, j] += WEIGHTS[n] * moves[j]
                 line_moves[k, 1, j] += rise * moves[j]
-    if line[0, 1] <= 0.0 or line[1, 1] <= 0.0:
-        return unseen
-    for k in range(2):
-        _set_cubic(slopes[:, k], radius, line[k, 0], line[k, 1], k, cubic[k])
-        _set_line(line[k], line_moves[k])
-    return Pencil(line, line_moves, cubic)
+    return True
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
@@ -227,8 +254,9 @@ def largest_of(cubic: Floats, radius: float) -> float:
 def lines_of(faces: Faces, radius: float, points: Floats) -> tuple[Floats, ...]:
     """Return of points (n, 3 or more) `Pencil.line` (n, 2, 2), `line_moves` (n, 2, 2, 3), and a bound of r (n, 2)."""
     lines, moves, largest = np.empty((len(points), 2, 2)), np.empty((len(points), 2, 2, 3)), np.empty((len(points), 2))
+    pencil = room_for_pencil()
     for n in range(len(points)):
-        pencil = pencil_of(faces, radius, points[n, 0], points[n, 1], points[n, 2])
+        set_pencil(faces, radius, points[n, 0], points[n, 1], points[n, 2], pencil)
         for k in range(2):
             largest[n, k] = largest_of(pencil.cubic[k], radius)
             for m in range(2):

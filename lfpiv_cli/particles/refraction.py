@@ -23,8 +23,8 @@ import numpy as np
 from lfpiv_cli.arrays import Floats
 from lfpiv_cli.kernels import COUNT_NO_REFERENCES, njit
 from lfpiv_cli.optics.curved_space import aim, trace_in
-from lfpiv_cli.optics.tracing import slope_polynomial, slope_ratio
-from lfpiv_cli.particles.pencil import cubic_at, largest_of, pencil_of
+from lfpiv_cli.optics.tracing import SLOPE_NODES, set_slope_polynomial, slope_ratio
+from lfpiv_cli.particles.pencil import Pencil, cubic_at, largest_of, room_for_pencil, set_pencil
 from lfpiv_cli.particles.view import View
 
 # The shift changes by some 1e-3 of what a point moves: twice leaves a millionth of it.
@@ -39,7 +39,7 @@ class Bend(NamedTuple):
     Attributes
     ----------
     x, y : the particle's lateral place
-    nodes, factors : of its rays' slopes, see `object_space.slope_ratio`; empty where these rays are straight, and
+    nodes, factors : of its rays' slopes, see `tracing.slope_ratio`; empty where these rays are straight, and
         behind curved faces
     seen_x, seen_y, distance_x, distance_y : the point in air, and its distances from the lens along both image axes;
         0 where the lens does not see the particle
@@ -58,6 +58,14 @@ class Bend(NamedTuple):
     cubic: Floats
 
 
+class Rays(NamedTuple):
+    """Room for the rays of a particle: nodes and factors behind plane faces, and a pencil behind curved ones."""
+
+    nodes: Floats
+    factors: Floats
+    pencil: Pencil
+
+
 @njit(cache=True, **COUNT_NO_REFERENCES)
 def _in_fluid(view: View, z: float) -> float:
     """Return a depth, or that just behind the window where it lies in front of the fluid."""
@@ -65,25 +73,28 @@ def _in_fluid(view: View, z: float) -> float:
 
 
 @njit(cache=True)
-def bend_of(view: View, x: float, y: float, z: float) -> Bend:
-    """Return the rays of a particle, image axes.
+def room_for_rays() -> Rays:
+    """Return the room for the rays of a particle."""
+    return Rays(np.zeros(SLOPE_NODES), np.zeros(SLOPE_NODES), room_for_pencil())
+
+
+@njit(cache=True, **COUNT_NO_REFERENCES)
+def bend_of(view: View, x: float, y: float, z: float, rays: Rays) -> Bend:
+    """Return the rays of a particle, image axes, whose arrays stand in that room.
 
     The point in air has their slopes in the middle of the lens, and at sqrt(2/3) of its radius.
     """
-    camera, faces, none = view.camera, view.faces, view.faces.ratios
+    camera, faces, (nodes, factors, pencil) = view.camera, view.faces, rays
+    line, flat, straight, none = pencil.line, pencil.line_moves[:0], pencil.cubic[:0], nodes[:0]
     if faces.ratios.size > 0:
-        line, line_moves, cubic = pencil_of(faces, camera.aperture_radius_mm, x, y, z)
-        none = np.empty(0)
-        return Bend(x, y, none, none, line[0, 0], line[1, 0], line[0, 1], line[1, 1], line_moves, cubic)
-    # Arrays of nothing that are there already.
-    straight, flat = faces.axes, np.empty((0, 2, 3))
+        set_pencil(faces, camera.aperture_radius_mm, x, y, z, pencil)
+        place_x, place_y, distance_x, distance_y = line[0, 0], line[1, 0], line[0, 1], line[1, 1]
+        return Bend(x, y, none, none, place_x, place_y, distance_x, distance_y, pencil.line_moves, pencil.cubic)
     if view.layers.indices.size < 2:
         distance = camera.focus_distance_mm + view.depth_ratio * z
         return Bend(x, y, none, none, x, y, distance, distance, flat, straight)
-    thicknesses = view.layers.thicknesses_mm.copy()
-    thicknesses[-1] += _in_fluid(view, z)
     lateral2, radius = x * x + y * y, camera.aperture_radius_mm
-    nodes, factors = slope_polynomial(radius + np.sqrt(lateral2), thicknesses, view.layers.indices)
+    set_slope_polynomial(radius + np.sqrt(lateral2), view.layers, _in_fluid(view, z), nodes, factors)
     distance = 1.0 / slope_ratio(lateral2 + radius * radius / 1.5, nodes, factors)
     middle = distance * slope_ratio(lateral2, nodes, factors)
     return Bend(x, y, nodes, factors, middle * x, middle * y, distance, distance, flat, straight)
@@ -149,15 +160,19 @@ def places_by_snell(points_mm: Floats, view: View) -> Floats:
     return places
 
 
-@njit(cache=True)
 def paraxial_shift(points_mm: Floats, view: View) -> Floats:
     """Return how far (n, 3) from their places points are seen by who takes rays for paraxial, mm."""
     shift = np.zeros_like(points_mm)
-    if view.layers.indices.size < 2:
-        return shift
+    if view.layers.indices.size >= 2:
+        _fill_shift(points_mm, view, room_for_rays(), shift)
+    return shift
+
+
+@njit(cache=True, **COUNT_NO_REFERENCES)
+def _fill_shift(points_mm: Floats, view: View, rays: Rays, shift: Floats) -> None:
+    """Fill in `paraxial_shift` (n, 3) of points behind layers."""
     for n in range(points_mm.shape[0]):
         x, y, z = points_mm[n, 0], points_mm[n, 1], _in_fluid(view, points_mm[n, 2])
-        bend = bend_of(view, x, y, z)
+        bend = bend_of(view, x, y, z, rays)
         depth = (bend.distance_x - view.camera.focus_distance_mm) / view.depth_ratio
         shift[n, 0], shift[n, 1], shift[n, 2] = bend.seen_x - x, bend.seen_y - y, depth - z
-    return shift

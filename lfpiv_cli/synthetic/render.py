@@ -26,7 +26,7 @@ from lfpiv_cli.kernels import njit
 from lfpiv_cli.optics.camera import Camera, KernelCamera, Objective, nearest_point
 from lfpiv_cli.optics.curved_space import CurvedSpace
 from lfpiv_cli.optics.media import Layers
-from lfpiv_cli.optics.tracing import ObjectSpace, slope_polynomial, slope_ratio, struck_pixel
+from lfpiv_cli.optics.tracing import SLOPE_NODES, ObjectSpace, set_slope_polynomial, slope_ratio, struck_pixel
 from lfpiv_cli.optics.waves import DIFFUSION_REACH, Waves, WavesInCamera, samples_per_pixel
 from lfpiv_cli.synthetic.rays import (
     GOLDEN_ANGLE,
@@ -185,13 +185,11 @@ def _trace_points(
     beside where they would by each of `blur_mm` (m, 2) in turn.
     """
     points, radii, last_layers, shifts = placed
-    aperture_radius = camera.aperture_radius_mm
+    aperture_radius, nodes, factors = camera.aperture_radius_mm, np.empty(SLOPE_NODES), np.empty(SLOPE_NODES)
     for i in range(part[0], part[1]):
         ball_radius = radii[i]
-        thicknesses = layers.thicknesses_mm.copy()
-        thicknesses[-1] = last_layers[i]
         reach = aperture_radius + ball_radius + np.sqrt(points[i, 0] ** 2 + points[i, 1] ** 2)
-        nodes, factors = slope_polynomial(reach, thicknesses, layers.indices)
+        set_slope_polynomial(reach, layers, last_layers[i] - layers.thicknesses_mm[-1], nodes, factors)
         for k in range(pixels.shape[1]):
             radial, turn, ball_radial, ball_turn = ray_places(shifts, i, k)
             lens_x, lens_y = on_disc(aperture_radius, radial, turn)
