@@ -12,6 +12,7 @@ import cv2
 import numba
 
 from lfpiv_cli.errors import UsageError
+from lfpiv_cli.kernels import for_types_of
 
 # More than one, for pieces of work that do not take equally long; the threads wait for the last part.
 PARTS_A_THREAD = 4
@@ -138,7 +139,8 @@ def share_out(kernel: Callable[..., None], count: int, *arguments: object) -> No
     """
     threads = numba.get_num_threads()
     size = -(-count // (PARTS_A_THREAD * threads)) if threads > 1 else count
-    in_threads(lambda part: kernel((part.start, part.stop), *arguments), blocks(count, max(size, 1)))
+    call = for_types_of(kernel, (0, 0), *arguments)
+    in_threads(lambda part: call((part.start, part.stop), *arguments), blocks(count, max(size, 1)))
 
 
 def blocks(count: int, size: int) -> list[slice]:

@@ -520,21 +520,18 @@ def _fitted(
     """
     fitter = fitter_of(sized)
     change, fitted, starts = np.zeros(len(tracers)), tracers.copy(), np.clip(depths_mm, *observation.depths_mm)
-
-    def work(numbers: NDArray[np.int64]) -> None:
-        _fit_each(observation, fitter, tracers, numbers, starts, change, fitted)
-
     larger = max(observation.optics, sized.optics, key=lambda view: view.particle_radius_mm)
-    over_tiles(work, larger, tracers, observation.depths_mm)
+    arguments = observation, fitter, tracers, starts, change, fitted
+    over_tiles(_fit_each, larger, tracers, observation.depths_mm, *arguments)
     return change, fitted
 
 
 @njit(cache=True, nogil=True)
 def _fit_each(
+    numbers: NDArray[np.int64],
     observation: Observation,
     fitter: Fitter,
     tracers: NDArray[np.float64],
-    numbers: NDArray[np.int64],
     depths_mm: NDArray[np.float64],
     change: NDArray[np.float64],
     fitted: NDArray[np.float64],

@@ -259,20 +259,17 @@ def fit_again(
     expected = nothing_expected(len(particles)) if prior is None else prior
     others = Elsewhere(np.empty((len(particles), 0)), NOWHERE_ELSE, 0.0) if elsewhere is None else elsewhere
     fitter, refitted = fitter_of(observation), Refitted(np.zeros(len(particles), np.bool_), np.zeros(len(particles)))
-
-    def work(numbers: NDArray[np.int64]) -> None:
-        _fit_again(fitter, particles, expected, numbers[chosen[numbers]], effort, others, refitted)
-
-    over_tiles(work, observation.optics, particles, observation.depths_mm)
+    arguments = fitter, particles, expected, effort, others, refitted
+    over_tiles(_fit_again, observation.optics, particles, observation.depths_mm, *arguments, chosen=chosen)
     return refitted
 
 
 @njit(cache=True, nogil=True)
 def _fit_again(
+    numbers: NDArray[np.int64],
     fitter: Fitter,
     particles: Floats,
     prior: Floats,
-    numbers: NDArray[np.int64],
     effort: Effort,
     elsewhere: Elsewhere,
     refitted: Refitted,
@@ -315,21 +312,17 @@ def other_ends(
     Returned are the ends (n, k, 4), and by how much chi-squared is larger there than where they are (n, k), infinite
     for those that are not chosen. The residual is in place again on return.
     """
-    fitter = fitter_of(observation)
     ends, rises = np.zeros((*places.shape[:2], UNKNOWNS)), np.full(places.shape[:2], np.inf)
-
-    def work(numbers: NDArray[np.int64]) -> None:
-        _other_ends(fitter, particles, numbers[chosen[numbers]], places, effort, ends, rises)
-
-    over_tiles(work, observation.optics, particles, observation.depths_mm)
+    arguments = fitter_of(observation), particles, places, effort, ends, rises
+    over_tiles(_other_ends, observation.optics, particles, observation.depths_mm, *arguments, chosen=chosen)
     return ends, rises
 
 
 @njit(cache=True, nogil=True)
 def _other_ends(
+    numbers: NDArray[np.int64],
     fitter: Fitter,
     particles: Floats,
-    numbers: NDArray[np.int64],
     places: Floats,
     effort: Effort,
     ends: Floats,
@@ -388,19 +381,16 @@ def accept(observation: Observation, candidates: Floats, least: Least) -> NDArra
     depths = np.clip(depths, observation.low_mm, observation.high_mm)
     beside = np.pad(START_BESIDE * scale.lens_mm, ((0, 0), (0, 2)))
     narrow = np.abs(candidates[:, 2]) < FEW_LENSES * scale.depth_mm
-
-    def work(numbers: NDArray[np.int64]) -> None:
-        _accept(fitter, candidates, numbers, choice, depths, beside, narrow, least, accepted)
-
-    over_tiles(work, observation.optics, candidates, observation.depths_mm)
+    arguments = fitter, candidates, choice, depths, beside, narrow, least, accepted
+    over_tiles(_accept, observation.optics, candidates, observation.depths_mm, *arguments)
     return accepted
 
 
 @njit(cache=True, nogil=True)
 def _accept(
+    numbers: NDArray[np.int64],
     fitter: Fitter,
     candidates: Floats,
-    numbers: NDArray[np.int64],
     choice: Choice,
     depths: Floats,
     beside: Floats,
@@ -443,21 +433,16 @@ def _holds(fitter: Fitter, starts: Floats, responses: Responses, choice: Choice,
 
 def add_all(view: View, particles: Floats, sign: float, image: Floats, depths_mm: tuple[float, float]) -> None:
     """Add the light of all particles (n, 4) between two depths, times `sign`, to an image."""
-    capacity = entry_capacity(view, *depths_mm)
-    respond = respond_of(view)
-
-    def work(numbers: NDArray[np.int64]) -> None:
-        _add_all(respond, view, particles, numbers, sign, image, capacity)
-
-    over_tiles(work, view, particles, depths_mm)
+    arguments = respond_of(view), view, particles, sign, image, entry_capacity(view, *depths_mm)
+    over_tiles(_add_all, view, particles, depths_mm, *arguments)
 
 
 @njit(cache=True, nogil=True)
 def _add_all(
+    numbers: NDArray[np.int64],
     respond: Respond,
     view: View,
     particles: Floats,
-    numbers: NDArray[np.int64],
     sign: float,
     image: Floats,
     capacity: int,
@@ -478,20 +463,16 @@ def judge(observation: Observation, particles: Floats) -> tuple[Floats, Floats, 
     """
     chi2, share, brightest, seen = (np.zeros(len(particles)) for _ in range(4))
     # By tiles: neighbours' pixels are still at hand.
-    over_tiles(
-        lambda numbers: _judge(observation, particles, numbers, chi2, share, brightest, seen),
-        observation.optics,
-        particles,
-        observation.depths_mm,
-    )
+    arguments = observation, particles, chi2, share, brightest, seen
+    over_tiles(_judge, observation.optics, particles, observation.depths_mm, *arguments)
     return chi2, share, brightest, seen
 
 
 @njit(cache=True, nogil=True)
 def _judge(
+    numbers: NDArray[np.int64],
     observation: Observation,
     particles: Floats,
-    numbers: NDArray[np.int64],
     chi2: Floats,
     share: Floats,
     brightest: Floats,

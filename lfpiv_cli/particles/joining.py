@@ -199,25 +199,23 @@ def join(
     middle = np.sum(particles[pairs] * light, axis=1) / np.maximum(light.sum(axis=1), np.finfo(np.float64).tiny)
     # Starts lie in the middle: from there fits move no further than tiles allow.
     limits = np.column_stack([largest_loss, brightest])
-
-    def work(numbers: NDArray[np.int64]) -> None:
-        joined[numbers] = _join(fitter, particles, middle, pairs, numbers, limits, free)
-
-    over_tiles(work, observation.optics, middle, observation.depths_mm)
+    arguments = fitter, particles, middle, pairs, limits, free, joined
+    over_tiles(_join, observation.optics, middle, observation.depths_mm, *arguments)
     return joined
 
 
 @njit(cache=True, nogil=True)
 def _join(
+    numbers: NDArray[np.int64],
     fitter: Fitter,
     particles: Floats,
     middle: Floats,
     pairs: NDArray[np.int64],
-    numbers: NDArray[np.int64],
     limits: Floats,
     free: NDArray[np.bool_],
-) -> NDArray[np.bool_]:
-    """Do the work of `join` for the pairs of a tile, and return which are joined.
+    joined: NDArray[np.bool_],
+) -> None:
+    """Do the work of `join` for the pairs of a tile, and fill in which are joined.
 
     `limits` (m, 2) are the largest loss and the most light, `free` particles that no pair has taken yet.
     """
@@ -225,8 +223,8 @@ def _join(
     view, residual, weight = observation.optics, observation.residual, observation.weight
     responses, prior = room_for(1, observation.capacity, 0), np.zeros((1, 2 * UNKNOWNS))
     depths, starts, best = np.empty(3), np.empty((3, 1, UNKNOWNS)), np.empty((1, UNKNOWNS))
-    effort, joined = Effort(STEPS, CHOICE_GAIN), np.zeros(numbers.size, np.bool_)
-    for k, number in enumerate(numbers):
+    effort = Effort(STEPS, CHOICE_GAIN)
+    for number in numbers:
         first, second = pairs[number]
         if not (free[first] and free[second]):
             continue
@@ -241,13 +239,12 @@ def _join(
         choice = Choice(effort, NO_FURTHER, len(starts), LEAST_LIGHT, limits[number, 1])
         highest = two + limits[number, 0]
         lowest = fitter.best(fitter.to, starts, prior, responses, choice, (np.inf, highest), best)
-        joined[k] = lowest < highest
-        if joined[k]:
+        joined[number] = lowest < highest
+        if joined[number]:
             copy_rows(best, particles[first : first + 1])
             free[first] = free[second] = False
         for member in (first, second):
-            if member == first or not joined[k]:
+            if member == first or not joined[number]:
                 observation.respond(view, particles[member : member + 1], responses)
                 pixels, values = lit_by(responses, 0)
                 add_light(pixels, values, -particles[member, 3], residual)
-    return joined

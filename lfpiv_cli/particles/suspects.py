@@ -73,19 +73,16 @@ def split(
     places = footprint_px(observation.optics, *observation.depths_mm) * observation.optics.camera.columns
     first, then = Effort(FIRST_STEPS, CHOICE_GAIN), Effort(PAIR_STEPS, CHOICE_GAIN)
     choice = Choice(first, then, FINALISTS, smallest_light, np.inf)
-
-    def work(numbers: NDArray[np.int64]) -> None:
-        _split(fitter, particles, numbers[suspects[numbers]], places, choice, smallest_gain, partners)
-
-    over_tiles(work, observation.optics, particles, observation.depths_mm)
+    arguments = fitter, particles, places, choice, smallest_gain, partners
+    over_tiles(_split, observation.optics, particles, observation.depths_mm, *arguments, chosen=suspects)
     return partners
 
 
 @njit(cache=True, nogil=True)
 def _split(
+    numbers: NDArray[np.int64],
     fitter: Fitter,
     particles: Floats,
-    numbers: NDArray[np.int64],
     places: int,
     choice: Choice,
     gain: float,

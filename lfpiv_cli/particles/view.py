@@ -23,6 +23,7 @@ from lfpiv_cli.arrays import Floats
 from lfpiv_cli.calibration.model import Calibration
 from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.grid import Scale
+from lfpiv_cli.kernels import for_types_of
 from lfpiv_cli.optics.camera import Camera, KernelCamera, Lattice, nearest_on_grid
 from lfpiv_cli.optics.curved_space import CurvedSpace
 from lfpiv_cli.optics.line_responses import NO_LINES, LineResponses, line_responses, of_balls, on_pixels
@@ -382,16 +383,27 @@ LARGEST_MOVE_LENSES = 1.5
 
 
 def over_tiles(
-    work: Callable[[NDArray[np.int64]], None], view: View, points: Floats, depths_mm: tuple[float, float]
+    kernel: Callable[..., None],
+    view: View,
+    points: Floats,
+    depths_mm: tuple[float, float],
+    *arguments: object,
+    chosen: NDArray[np.bool_] | None = None,
 ) -> None:
-    """Call work(numbers) with the particles of each tile, in their order, on all threads.
+    """Call kernel(numbers, *arguments) with the particles of each tile, in their order, on all threads.
 
     Parameters
     ----------
     points : (n, 3 or more), image axes
     depths_mm : between which particles stay
+    chosen : (n,) which of them are worked on; None: all
     """
-    in_threads(work, *tiles_of(view, points, depths_mm))
+    tiles, after = tiles_of(view, points, depths_mm)
+    if chosen is not None:
+        tiles = [numbers[chosen[numbers]] for numbers in tiles]
+    if tiles:
+        call = for_types_of(kernel, tiles[0], *arguments)
+        in_threads(lambda numbers: call(numbers, *arguments), tiles, after)
 
 
 def tiles_of(
