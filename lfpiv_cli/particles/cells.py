@@ -36,6 +36,7 @@ LEAST_LEAN, LEAST_SHARE = np.float32(1e-2), np.float32(1e-6)
 TINY = np.float32(1e-12)
 # In single precision, as what they meet may be: a plain number is in double, and all that follows from it.
 ZERO, QUARTER, HALF, ONE, TWO, THREE, FOUR, SIX = np.array([0.0, 0.25, 0.5, 1.0, 2.0, 3.0, 4.0, 6.0], np.float32)
+THIRD = ONE / THREE
 
 
 @njit(cache=True, error_model="numpy", inline="always", **COUNT_NO_REFERENCES)
@@ -49,7 +50,8 @@ def covered_share(x: Real, y: Real, width: Real, radius: Real) -> tuple[Real, Re
     """
     half = HALF * width
     away = max(np.sqrt(x * x + y * y), TINY)
-    to_x, to_y = abs(x) / away, abs(y) / away
+    per_away = ONE / away
+    to_x, to_y = abs(x) * per_away, abs(y) * per_away
     a, b = half * max(to_x, LEAST_LEAN), half * max(to_y, LEAST_LEAN)
     t = min(max(radius - away - half * half / (SIX * radius), -(a + b)), a + b)
     p, q = t + a + b, max(t + a - b, ZERO)
@@ -59,11 +61,11 @@ def covered_share(x: Real, y: Real, width: Real, radius: Real) -> tuple[Real, Re
     per_a, per_b = FOUR * b * per, FOUR * a * per
     per = per if per * (p2 - q2 - r2 + s2) > LEAST_SHARE else ZERO
     share, dense = per * (p2 - q2 - r2 + s2), per * (p - q - r + s)
-    third = (p * p2 - q * q2 - r * r2 + s * s2) / THREE
+    third = THIRD * (p * p2 - q * q2 - r * r2 + s * s2)
     mean_x = per * (per_a * third - (p2 - q2 + r2 - s2))
     mean_y = per * (per_b * third - (p2 + q2 - r2 - s2))
     by_a, by_b = per * (p - q + r - s) - per_a * share, per * (p + q - r - s) - per_b * share
-    turning = (by_a * to_y - by_b * to_x) * half / away
+    turning = (by_a * to_y - by_b * to_x) * half * per_away
     slope_x, slope_y = turning * to_y - dense * to_x, -turning * to_x - dense * to_y
     right, above = -ONE if x < ZERO else ONE, -ONE if y < ZERO else ONE
     return share, right * mean_x, above * mean_y, right * slope_x, above * slope_y

@@ -166,7 +166,7 @@ def diameter_by(
     frames: list[Sizes] = []
     for task in tasks:
         before = diameter_of(frames)
-        frames.append(measured_sizes(task, None if before is None else before.lenses))
+        frames.append(measured_sizes(task, lenses if before is None else before.lenses))
         # Where none of so many stands alone, with any size, in the next image none does either.
         if not frames[-1].square.size and frames[-1].candidates >= MOST_TRACERS:
             break
@@ -208,7 +208,8 @@ def diameter_of(frames: Sequence[Sizes]) -> Diameter | None:
 def measured_sizes(task: Task, diameter: float | None = None) -> Sizes:
     """Return what the tracers of an image show of their sizes; `task` may be of any size.
 
-    Where a `diameter` is known by another image the search begins with it; it may still lead to another one.
+    Where a `diameter` is given, or known by another image, the search begins with it; it may still lead to another
+    one.
     """
     candidates, light = candidates_of(task, blank(task), ROUNDS[0].iterations, None)
     region = Region(np.zeros(2), 0.0)

@@ -26,7 +26,7 @@ from lfpiv_cli.arrays import Floats, Singles
 from lfpiv_cli.kernels import COUNT_NO_REFERENCES, by_address, njit
 from lfpiv_cli.particles.line_light import VALUES, respond_by_lines
 from lfpiv_cli.particles.refraction import Rays, bend_of, room_for_rays
-from lfpiv_cli.particles.rows import SLACK, Scratch, respond_rows, scratch
+from lfpiv_cli.particles.rows import Scratch, respond_rows, scratch
 from lfpiv_cli.particles.view import LARGEST_MOVE_LENSES, View, by_waves, entry_capacity, type_by_form
 
 UNKNOWNS = 4
@@ -120,12 +120,10 @@ class Effort(NamedTuple):
 @njit(cache=True)
 def room_for(members: int, capacity: int, places: int) -> Responses:
     """Return room for the responses of so many particles."""
-    room = capacity + SLACK
-    pixels, values = np.empty((members, room), np.int32), np.empty((members, VALUES, room), np.float32)
-    common = np.empty((2, UNKNOWNS, room if members == 2 else 0))
-    place, picked, began = np.zeros(places, np.int32), np.empty((2, room)), np.zeros(1)
-    counts, rays = np.zeros(members, np.int64), room_for_rays()
-    passed = np.empty(room, np.float32)
+    pixels, values = np.empty((members, capacity), np.int32), np.empty((members, VALUES, capacity), np.float32)
+    common = np.empty((2, UNKNOWNS, capacity if members == 2 else 0))
+    place, picked, began = np.zeros(places, np.int32), np.empty((2, capacity)), np.zeros(1)
+    counts, rays, passed = np.zeros(members, np.int64), room_for_rays(), np.empty(capacity, np.float32)
     return Responses(counts, pixels, values, place, common, picked, passed, began, rays, scratch(capacity))
 
 

@@ -3,7 +3,7 @@
 `response` has the theory. Lit pixels of all of a block's columns of lenses stand side by side, as do those of its rows:
 a *column* below is a column of pixels of one column of lenses. All numbers of a block stand in the rows, `STRIDE` long,
 of one flat table, and loops run over `WIDTH` neighbours, so that the compiler makes vector code of them: it need not
-ask whether arrays overlap, nor what to do with a rest. More pixels than are asked for are written therefore, up to a
+ask whether arrays overlap, nor what to do with a rest. More columns than are asked for are filled in therefore, up to a
 whole `WIDTH`.
 
 Lenses of a column do not stand exactly above one another where the array is turned. Along x all follow from the
@@ -36,20 +36,20 @@ DENSE, MOMENT = np.float32(0.75), np.float32(0.1875)
 # Rows of a profile: mean and slope of the share P of the ball that is seen, their derivatives by x and by z, those of
 # the mean's by x, and where what is seen of the ball is seen from; the patch's middle, by how much the middle of the
 # main lens shows the ball off the lens, what the profile was moved by for bent rays, how much further the lens stands
-# along the other axis, how far from the axis the patch lies, or its twin (`rows`) where that is nearer, and by how much
-# profiles along the other axis are moved, over their derivative by x or y.
+# along the other axis, how far from the axis the patch lies, or its twin (`rows`) where that is nearer, by how much
+# profiles along the other axis are moved, over their derivative by x or y, and `set_furthest`.
 MEAN, SLOPE, MEAN_X, SLOPE_X, MEAN_Z, SLOPE_Z, MEAN_XX, MEAN_XZ, SEEN_FROM = (row * STRIDE for row in range(9))
-PATCH, OFFSET, MOVED, DRIFT, AWAY, LEAN = (row * STRIDE for row in range(9, 15))
+PATCH, OFFSET, MOVED, DRIFT, AWAY, LEAN, FURTHEST = (row * STRIDE for row in range(9, 16))
 # In the table: the profile along x; of a row of pixels light and its derivatives; the profile along y.
-SHOWN, DOWN = 15 * STRIDE, 19 * STRIDE
-TABLE_SIZE = 34 * STRIDE
+SHOWN, DOWN = 16 * STRIDE, 20 * STRIDE
+TABLE_SIZE = 36 * STRIDE
 # Of a ball; what sees less sees nothing.
 SMALLEST_SHARE = np.float32(1e-9)
 # What the rim leaves of a patch that it does not touch: all; see `cells.covered_share`.
 WHOLE = (ONE, ZERO, ZERO, ZERO, ZERO)
 
 # No fastmath: a kernel is optimised again in each that calls it, and in another order its sums have other last digits.
-VECTORISED: dict[str, Any] = {"cache": True, "error_model": "numpy", **COUNT_NO_REFERENCES}
+VECTORISED: dict[str, Any] = {"cache": True, "error_model": "numpy", "fastmath": {"contract"}, **COUNT_NO_REFERENCES}
 Four: TypeAlias = tuple[Real, Real, Real, Real]
 
 
@@ -258,13 +258,13 @@ def join_row(
     ----------
     columns : the first and their number
     rim : the width of a patch, the main lens's radius, and the square of the distance from its axis within which the
-        rim leaves all of a patch
+        rim leaves all of a patch, wherever its lens stands
     per_drift : (2,) how much further patches lie along x and y where lenses do
     """
     line = _line(table, row, per_drift)
     for begin in range(0, columns[1], WIDTH):
         rows = table[columns[0] + begin :]
-        if _furthest(rows, line) < rim[2]:
+        if rows[FURTHEST] * rows[FURTHEST] + line.patch * line.patch < rim[2]:
             for n in range(WIDTH):
                 _join(rows, n, line, WHOLE, of)
         else:
@@ -272,14 +272,14 @@ def join_row(
                 _join(rows, n, line, _covered(rows, n, line, rim), of)
 
 
-@njit(inline="always", **VECTORISED)
-def _furthest(rows: Singles, line: Line) -> Real:
-    """Return the square of the largest distance of `WIDTH` patches from the axis."""
-    furthest = ZERO
-    for n in range(WIDTH):
-        x, y = rows[PATCH + n] + line.across, line.patch + line.down * rows[DRIFT + n]
-        furthest = max(furthest, x * x + y * y)
-    return furthest
+@njit(**VECTORISED)
+def set_furthest(table: Singles, columns: int) -> None:
+    """Set how far from the axis any of `WIDTH` patches from each column on lies at most."""
+    for n in range(columns):
+        furthest = ZERO
+        for k in range(min(WIDTH, columns - n)):
+            furthest = max(furthest, abs(table[PATCH + n + k]))
+        table[FURTHEST + n] = furthest
 
 
 @njit(inline="always", **VECTORISED)
@@ -354,7 +354,7 @@ def join_curved_row(
     line = _line(table, row, per_drift)
     for begin in range(0, columns[1], WIDTH):
         rows = table[columns[0] + begin :]
-        if _furthest(rows, line) < rim[2]:
+        if rows[FURTHEST] * rows[FURTHEST] + line.patch * line.patch < rim[2]:
             for n in range(WIDTH):
                 _join_curved(rows, n, line, WHOLE, of, slopes)
         else:
@@ -412,17 +412,12 @@ def take_row(
 
     `to` is this number, the columns' pixels in a row, and the flat number of the row's first pixel.
     """
-    at, places, pixel = to
-    named, light, by_x, by_y, by_z = pixels[at:], values[0, at:], values[1, at:], values[2, at:], values[3, at:]
-    for begin in range(0, columns[1], WIDTH):
-        shown = table[SHOWN + columns[0] + begin :]
-        for n in range(WIDTH):
-            named[begin + n] = pixel + places[columns[0] + begin + n]
-        for n in range(WIDTH):
-            light[begin + n] = shown[n]
-        for n in range(WIDTH):
-            by_x[begin + n] = shown[STRIDE + n]
-        for n in range(WIDTH):
-            by_y[begin + n] = shown[2 * STRIDE + n]
-        for n in range(WIDTH):
-            by_z[begin + n] = shown[3 * STRIDE + n]
+    (first, count), (at, places, pixel) = columns, to
+    named, placed = pixels[at : at + count], places[first : first + count]
+    for n in range(count):
+        named[n] = pixel + placed[n]
+    for k in range(values.shape[0]):
+        source = table[SHOWN + k * STRIDE + first : SHOWN + k * STRIDE + first + count]
+        target = values[k, at : at + count]
+        for n in range(count):
+            target[n] = source[n]

@@ -28,13 +28,13 @@ from lfpiv_cli.particles.micro_images import (
     SHOWN,
     STRIDE,
     TABLE_SIZE,
-    WIDTH,
     Curved,
     Four,
     Plane,
     fill_profile,
     join_curved_row,
     join_row,
+    set_furthest,
     take_row,
 )
 from lfpiv_cli.particles.pencil import in_row
@@ -52,9 +52,6 @@ from lfpiv_cli.particles.response import (
     seen_moves,
 )
 from lfpiv_cli.particles.view import View
-
-# A row of a micro-image is written up to a whole `WIDTH`: so many entries more than there are.
-SLACK = WIDTH
 
 
 class Scratch(NamedTuple):
@@ -317,6 +314,7 @@ def _write_block(
     _set_away(room, columns)
     if block.alone:
         _order_columns(room, columns, mean_width(view, projection))
+    set_furthest(room.table, columns)
     rows = _line_up(view, projection, (bend, bent), block, AXES[1], room)
     if rows == 0:
         return 0
@@ -485,10 +483,11 @@ def _write_rows(
     (rows, columns), table, lines, per_drift = lit, room.table, room.lines, room.per_drift
     radius, width = camera.aperture_radius_mm, mean_width(view, projection)
     # Further from the axis, wherever its lens stands, a patch is that the rim does not touch from outside.
-    outside = (radius + 0.71 * width + _drifts(table, columns, rows, per_drift)) ** 2
+    drifts = _drifts(table, columns, rows, per_drift)
+    outside = (radius + 0.71 * width + drifts) ** 2
     # Of patches that the rim, with its sagitta, does not touch, from wherever the edge of the ball is seen.
     away = np.hypot(x.lever * x.beta * x.ball / x.scale, y.lever * y.beta * y.ball / y.scale)
-    inside = max(radius - 0.75 * width - away, 0.0) ** 2
+    inside = max(radius - 0.75 * width - away - drifts, 0.0) ** 2
     rim = np.float32(width), np.float32(radius), np.float32(inside)
     curved = bend.cubic.shape[0] > 0
     if curved:
@@ -500,7 +499,7 @@ def _write_rows(
     for m in range(rows):
         low, high = _columns_within(table, columns, outside - table[DOWN + PATCH + m] ** 2)
         lines[ENTRY, m], lines[LOW, m] = at, low
-        if low >= high or at + high - low + SLACK > pixels.size:
+        if low >= high or at + high - low > pixels.size:
             lines[LOW, m] = columns
             continue
         chosen = (low, high - low)
