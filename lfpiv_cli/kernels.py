@@ -23,6 +23,9 @@ from numba.core.typing.templates import Signature
 # others would count down what it has not counted up, and the arrays would be gone while they are in use. One that makes
 # arrays and is called by one that counts none says so.
 COUNT_NO_REFERENCES, COUNT_REFERENCES = {"_nrt": False}, {"_nrt": True}
+# For those that are called once or twice for each particle with all that a view holds: to hand over its two hundred
+# numbers took a tenth of the time of a response.
+IN_PLACE: dict[str, Any] = {"cache": True, "forceinline": True, **COUNT_NO_REFERENCES}
 
 
 class _Compiled(CPUDispatcher):

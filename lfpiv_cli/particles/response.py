@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lfpiv_cli.arrays import Floats
-from lfpiv_cli.kernels import COUNT_NO_REFERENCES, njit
+from lfpiv_cli.kernels import COUNT_NO_REFERENCES, IN_PLACE, njit
 from lfpiv_cli.particles.cells import BALL_VARIANCE, covered_share, level_at, share_at
 from lfpiv_cli.particles.micro_images import LONGEST
 from lfpiv_cli.particles.pencil import rises_at
@@ -82,7 +82,7 @@ class Bent(NamedTuple):
     gain_y: float
 
 
-@njit(cache=True, **COUNT_NO_REFERENCES)
+@njit(**IN_PLACE)
 def project(view: View, bend: Bend) -> Projection:
     """Return how the main lens shows a particle."""
     camera = view.camera
@@ -105,7 +105,7 @@ def _length(vector: Floats) -> float:
     return float(np.sqrt(vector[0] * vector[0] + vector[1] * vector[1] + vector[2] * vector[2]))
 
 
-@njit(cache=True, **COUNT_NO_REFERENCES)
+@njit(**IN_PLACE)
 def _along(
     view: View, x: float, beta: float, distance: float, r2: float, wide: float, cell: tuple[float, int]
 ) -> Along:
@@ -134,7 +134,7 @@ def _along(
     )
 
 
-@njit(cache=True, **COUNT_NO_REFERENCES)
+@njit(**IN_PLACE)
 def bent_at(view: View, projection: Projection, bend: Bend, s_x: float, s_y: float) -> Bent:
     """Return what bent rays are moved by on the array through the lens at s: as in the middle of its patches.
 
@@ -161,7 +161,7 @@ def _middle_of_part(gain: float, offset: float, reach: float, radius: float) -> 
     return min(max(0.5 * (low + high), -radius), radius)
 
 
-@njit(cache=True, **COUNT_NO_REFERENCES)
+@njit(**IN_PLACE)
 def part_of_lens(gain: float, offset: float, reach: float, radius: float) -> tuple[float, float]:
     """Return between which X of -radius to radius `offset` + `gain` X is within `reach` of 0.
 
@@ -175,7 +175,7 @@ def part_of_lens(gain: float, offset: float, reach: float, radius: float) -> tup
     return -radius, radius
 
 
-@njit(cache=True, **COUNT_NO_REFERENCES)
+@njit(**IN_PLACE)
 def lenses_of(view: View, projection: Projection, bend: Bend) -> tuple[int, int, int, int]:
     """Return the ranges of lens indices, first and last along i and j, whose cells the light can reach."""
     camera, x, y = view.camera, projection.x, projection.y
@@ -197,7 +197,7 @@ def lenses_of(view: View, projection: Projection, bend: Bend) -> tuple[int, int,
     return low_i, high_i, low_j, high_j
 
 
-@njit(cache=True, **COUNT_NO_REFERENCES)
+@njit(**IN_PLACE)
 def lit_pixels(
     view: View, gain: float, offset: float, reach: float, scale: float, shift: float, pixels: int
 ) -> tuple[int, int]:
@@ -217,7 +217,7 @@ def lit_pixels(
     return first, max(min(last - first + 1, LONGEST), 0)
 
 
-@njit(cache=True, **COUNT_NO_REFERENCES)
+@njit(**IN_PLACE)
 def mean_width(view: View, projection: Projection) -> float:
     """Return the side of a square as large as a pixel's patch on the main lens."""
     return float(view.camera.pixel_mm / np.sqrt(projection.x.scale * projection.y.scale))

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lfpiv_cli.arrays import Floats, Singles
-from lfpiv_cli.kernels import COUNT_NO_REFERENCES, njit
+from lfpiv_cli.kernels import COUNT_NO_REFERENCES, IN_PLACE, njit
 from lfpiv_cli.particles.micro_images import (
     AWAY,
     DOWN,
@@ -116,7 +116,7 @@ def scratch(capacity: int) -> Scratch:
     return Scratch(table, per_drift, np.zeros((6, STRIDE), np.int64), np.empty((capacity + 1, 5), np.int64))
 
 
-@njit(cache=True, **COUNT_NO_REFERENCES)
+@njit(**IN_PLACE)
 def respond_rows(view: View, bend: Bend, pixels: NDArray[np.int32], values: Singles, room: Scratch) -> int:
     """Write the entries of a particle of unit light; return their number.
 
@@ -188,7 +188,7 @@ def _write_blocks(
     return int(ends[shown, 0])
 
 
-@njit(cache=True, **COUNT_NO_REFERENCES)
+@njit(**IN_PLACE)
 def _shared(view: View, projection: Projection, bend: Bend, i: int, j: int) -> tuple[int, float]:
     """Return how many lenses along a side of a block share profiles, and what moves these by how much at most, mm.
 
@@ -214,14 +214,14 @@ def _shared(view: View, projection: Projection, bend: Bend, i: int, j: int) -> t
     return side, (bent + 0.5 * (side - 1) * drift) if side > 1 else 0.0
 
 
-@njit(cache=True, **COUNT_NO_REFERENCES)
+@njit(**IN_PLACE)
 def _norm(view: View, projection: Projection) -> float:
     """Return the light of a whole patch that sees the whole ball."""
     width = mean_width(view, projection)
     return float(width * width / (np.pi * view.camera.aperture_radius_mm**2))
 
 
-@njit(cache=True, **COUNT_NO_REFERENCES)
+@njit(**IN_PLACE)
 def _plane(view: View, projection: Projection, bend: Bend) -> Plane:
     """Return what the pixels of a particle behind plane faces follow from; without bends where rays are straight."""
     single, x, nodes, factors = np.float32, projection.x, bend.nodes, bend.factors
@@ -290,7 +290,7 @@ def _moves(view: View, bend: Bend, axis: int) -> Four:
     return np.float32(x), np.float32(y), np.float32(deep_x), np.float32(deep_y)
 
 
-@njit(cache=True, **COUNT_NO_REFERENCES)
+@njit(**IN_PLACE)
 def _write_block(
     view: View,
     projection: Projection,
@@ -462,7 +462,7 @@ def _fill(view: View, along: Along, gain: float, count: int, out: Singles) -> No
     fill_profile(out, count, numbers)
 
 
-@njit(cache=True, **COUNT_NO_REFERENCES)
+@njit(**IN_PLACE)
 def _write_rows(
     view: View,
     projection: Projection,
