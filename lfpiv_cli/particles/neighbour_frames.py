@@ -31,6 +31,7 @@ from lfpiv_cli.particles.rounds import (
     after_rounds,
     candidates_of,
     finished,
+    steps_of,
     with_candidates,
     with_suspects_checked,
 )
@@ -80,7 +81,7 @@ SWEEPS = 2
 # Where fewer than this share of them go on, the frame does not go on from the ones before.
 LEAST_FOUND = 0.3
 # Units of progress that `find_predicted` reports.
-STEPS = sum(settings.iterations + 1 for settings in SEARCHES)
+STEPS = steps_of(SEARCHES)
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,7 +169,7 @@ EXPECTED_LENSES, EXPECTED_DEPTHS = 0.2, 0.1 / 1.064
 # Share of the first frame's particles that must be expected so.
 LEAST_EXPECTED = 0.6
 # Units of progress that prediction saves.
-SAVED_STEPS = sum(settings.iterations + 1 for settings in ROUNDS[1:]) - STEPS
+SAVED_STEPS = steps_of(ROUNDS[1:]) - STEPS
 
 
 def second_frame(task: Task, before: Task, particles: Floats, progress: Callable[[int], None] | None = None) -> Floats:

@@ -71,6 +71,8 @@ ROUNDS = (
     Round(6, 0.6, 0.05, thorough=True),
 )
 
+# A thorough round that finds no more than this share more is the last one; what follows looks for more anyway.
+FEW = 0.01
 # Sweeps of refinement after candidates and after splitting.
 SWEEPS, SWEEPS_AFTER_SPLIT = 4, 1
 # How often particles are checked, and joined afterwards, at most: until that changes their number by hardly any more.
@@ -112,13 +114,23 @@ def first_pass(task: Task, rounds: tuple[Round, ...] = ROUNDS, progress: Callabl
 def after_rounds(
     task: Task, state: State, rounds: tuple[Round, ...], progress: Callable[[int], None] | None = None
 ) -> State:
-    """Return the state after some more rounds."""
-    for settings in rounds:
+    """Return the state after some more rounds: as many as find more than few that the one before had not."""
+    for number, settings in enumerate(rounds):
+        before = len(state.particles)
         candidates, light = candidates_of(task, state, settings.iterations, progress)
         state = explained(task, *with_candidates(task, state, candidates, light), settings)
         if progress:
             progress(1)
+        if settings.thorough and len(state.particles) - before <= FEW * before:
+            if progress:
+                progress(steps_of(rounds[number + 1 :]))
+            break
     return state
+
+
+def steps_of(rounds: tuple[Round, ...]) -> int:
+    """Return the units of progress that rounds report."""
+    return sum(settings.iterations + 1 for settings in rounds)
 
 
 def finished(task: Task, state: State, settings: Round) -> State:

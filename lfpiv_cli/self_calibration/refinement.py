@@ -26,7 +26,7 @@ from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.tracing import ObjectSpace
 from lfpiv_cli.particles.diameter import UNKNOWN_LENSES, diameter_by
 from lfpiv_cli.particles.refraction import places_by_snell
-from lfpiv_cli.particles.rounds import ROUNDS, after_rounds, find_particles, finished
+from lfpiv_cli.particles.rounds import ROUNDS, after_rounds, find_particles, finished, steps_of
 from lfpiv_cli.particles.search import Task, blank, task_of
 from lfpiv_cli.particles.stated import Particles, light_left, result
 from lfpiv_cli.particles.view import Light, View, raw_view, with_radius
@@ -68,7 +68,7 @@ EARLY_ROUNDS, MOST_LEFT_EARLY = 2, 0.45
 # radii, wherever its axis is; the wall itself is taken for the pipe's own up to `walls.WIDTH_TOLERANCE`.
 OUTERMOST_SHARE, LEAST_REACH = 0.02, 0.9
 # Units of progress for each image; there is one more for the first.
-STEPS = sum(settings.iterations + 1 for settings in REFINING_ROUNDS)
+STEPS = steps_of(REFINING_ROUNDS)
 # Particles are looked for this share of the channel's width beyond the walls on each side.
 MARGIN_PER_WIDTH = 0.15
 # Candidates' depths need planes only this far apart, in depths over which light spreads by one lens (Table 2: 0.2 mm);

@@ -32,7 +32,7 @@ from lfpiv_cli.particles.counting import tracers_per_lens as counted
 from lfpiv_cli.particles.diameter import ENOUGH, UNKNOWN_LENSES, diameter_by
 from lfpiv_cli.particles.neighbour_frames import second_frame, second_pass
 from lfpiv_cli.particles.noise import beside_neighbours
-from lfpiv_cli.particles.rounds import ROUNDS, first_pass
+from lfpiv_cli.particles.rounds import ROUNDS, first_pass, steps_of
 from lfpiv_cli.particles.search import LAST_UNEXPLAINED, MARGIN_DEPTHS, Task, task_of
 from lfpiv_cli.particles.stated import MUCH_LEFT, Particles, result
 from lfpiv_cli.particles.view import Light, View, ensure_square_cells, raw_view
@@ -51,7 +51,7 @@ LOOKED_AT = 5
 # Depths beyond the volume for which light as waves is known, in depths over which light spreads by one lens.
 BEYOND_DEPTHS = MARGIN_DEPTHS + 0.2
 # Units of progress that `find`, `find_first` and `find_second` report.
-STEPS = sum(settings.iterations + 1 for settings in ROUNDS)
+STEPS = steps_of(ROUNDS)
 
 
 def find_particles(
