@@ -23,7 +23,7 @@ from numba.core.typing.typeof import typeof_impl
 from numpy.typing import NDArray
 
 from lfpiv_cli.arrays import Floats, Singles
-from lfpiv_cli.kernels import COUNT_NO_REFERENCES, by_address, njit
+from lfpiv_cli.kernels import COUNT_NO_REFERENCES, COUNT_REFERENCES, by_address, njit
 from lfpiv_cli.particles.line_light import VALUES, respond_by_lines
 from lfpiv_cli.particles.refraction import Rays, bend_of, room_for_rays
 from lfpiv_cli.particles.rows import Scratch, respond_rows, scratch
@@ -58,6 +58,8 @@ class Responses(NamedTuple):
     passed : (capacity,) room for the share of light that reaches these pixels
     began : (1,) what particles added to chi-squared where the last fit began
     rays, scratch : room for a particle's rays, and for what lenses show
+    matrices, vectors, places : (3, 4 k, 4 k), (3, 4 k) and (2, k, 4), room for the steps of a fit
+    block : (4, 4) room for what one of two does to the pixels
     """
 
     counts: NDArray[np.int64]
@@ -70,6 +72,10 @@ class Responses(NamedTuple):
     began: Floats
     rays: Rays
     scratch: Scratch
+    matrices: Floats
+    vectors: Floats
+    places: Floats
+    block: Floats
 
 
 Respond: TypeAlias = Callable[[View, Floats, Responses], None]
@@ -124,7 +130,9 @@ def room_for(members: int, capacity: int, places: int) -> Responses:
     common = np.empty((2, UNKNOWNS, capacity if members == 2 else 0))
     place, picked, began = np.zeros(places, np.int32), np.empty((2, capacity)), np.zeros(1)
     counts, rays, passed = np.zeros(members, np.int64), room_for_rays(), np.empty(capacity, np.float32)
-    return Responses(counts, pixels, values, place, common, picked, passed, began, rays, scratch(capacity))
+    n = UNKNOWNS * members
+    of_fit = np.empty((3, n, n)), np.zeros((3, n)), np.empty((2, members, UNKNOWNS)), np.empty((UNKNOWNS, UNKNOWNS))
+    return Responses(counts, pixels, values, place, common, picked, passed, began, rays, scratch(capacity), *of_fit)
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
@@ -135,7 +143,7 @@ def copy_rows(source: Floats, target: Floats) -> None:
             target[row, column] = source[row, column]
 
 
-@njit(cache=True)
+@njit(cache=True, **COUNT_REFERENCES)
 def lit_by(responses: Responses, member: int) -> tuple[NDArray[np.int32], Singles]:
     """Return the pixels (n,) that a particle lights, and values (4, n or more), the first of which are theirs."""
     return responses.pixels[member][: responses.counts[member]], responses.values[member]
@@ -208,7 +216,7 @@ def _product(one: Floats, other: Floats) -> float:
     return total
 
 
-@njit(cache=True)
+@njit(cache=True, **COUNT_NO_REFERENCES)
 def _pair_equations(
     observation: Observation, pair: Floats, responses: Responses, matrix: Floats, right: Floats
 ) -> float:
@@ -217,9 +225,9 @@ def _pair_equations(
     The place of the responses is zero again on return.
     """
     columns, residual, weight = observation.optics.camera.columns, observation.residual, observation.weight
-    block = np.empty((UNKNOWNS, UNKNOWNS))
-    pixels_1, values_1 = lit_by(responses, 0)
-    pixels_2, values_2 = lit_by(responses, 1)
+    block = responses.block
+    pixels_1, values_1 = responses.pixels[0][: responses.counts[0]], responses.values[0]
+    pixels_2, values_2 = responses.pixels[1][: responses.counts[1]], responses.values[1]
     picked = responses.picked
     change = normal_equations(pixels_1, values_1, pair[0, 3], observation, picked, block, right[:UNKNOWNS])
     copy_rows(block, matrix[:UNKNOWNS, :UNKNOWNS])
@@ -297,7 +305,7 @@ def substitute(lower: Floats, right: Floats, solution: Floats) -> None:
         solution[i] = total / lower[i, i]
 
 
-@njit(cache=True)
+@njit(cache=True, **COUNT_NO_REFERENCES)
 def fit(observation: Observation, members: Floats, prior: Floats, responses: Responses, effort: Effort) -> float:
     """Improve one particle or two (k, 4) in place; return what they add to chi-squared (below 0 where they help).
 
@@ -309,9 +317,10 @@ def fit(observation: Observation, members: Floats, prior: Floats, responses: Res
     responses : of the particles, on entry as on return; says on return where the fit began
     """
     n = UNKNOWNS * members.shape[0]
-    matrix, trial_matrix, lower = np.empty((n, n)), np.empty((n, n)), np.empty((n, n))
-    right, trial_right = np.empty(n), np.empty(n)
-    step, trial, begin = np.zeros(n), np.empty_like(members), members.copy()
+    matrix, trial_matrix, lower = responses.matrices[0], responses.matrices[1], responses.matrices[2]
+    right, trial_right, step = responses.vectors[0], responses.vectors[1], responses.vectors[2]
+    trial, begin = responses.places[0], responses.places[1]
+    copy_rows(members, begin)
     change = _equations(observation, members, prior, responses, matrix, right)
     responses.began[0] = change
     damping, last_failed = DAMPING, False
@@ -343,7 +352,7 @@ def fit(observation: Observation, members: Floats, prior: Floats, responses: Res
 
 
 # Inlined: one function less to compile all of the response into.
-@njit(cache=True, inline="always")
+@njit(cache=True, inline="always", **COUNT_NO_REFERENCES)
 def _equations(
     observation: Observation, members: Floats, prior: Floats, responses: Responses, matrix: Floats, right: Floats
 ) -> float:
@@ -351,7 +360,7 @@ def _equations(
     if members.shape[0] == 2:
         change = _pair_equations(observation, members, responses, matrix, right)
     else:
-        pixels, values = lit_by(responses, 0)
+        pixels, values = responses.pixels[0][: responses.counts[0]], responses.values[0]
         change = normal_equations(pixels, values, members[0, 3], observation, responses.picked, matrix, right)
     for m in range(members.shape[0]):
         for i in range(UNKNOWNS):
