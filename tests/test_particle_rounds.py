@@ -19,7 +19,7 @@ from lfpiv_cli.particles.joining import boxes_of, explain_rest, find_peaks
 from lfpiv_cli.particles.rounds import ROUNDS, find_particles, first_pass, first_typical_light
 from lfpiv_cli.particles.search import noise_with
 from lfpiv_cli.particles.view import Light, lens_pixels, raw_view
-from lfpiv_cli.reconstruction.solvers import normalisers
+from lfpiv_cli.reconstruction.solvers import Problem, normalisers
 from lfpiv_cli.synthetic.render import Balls, render_points
 from lfpiv_cli.validation.volume import particle_figures
 from lfpiv_cli.weights.model import Weights
@@ -216,7 +216,7 @@ def test_what_is_explained_gives_no_candidate(table2: Camera, water: Media) -> N
     one = np.zeros_like(volume)
     one[2, 2, 2] = 1e5
     image, background = weights.forward(volume), weights.forward(one)
-    rest = explain_rest(weights, image, background, normalisers(weights.padded), 10)
+    rest = explain_rest(Problem.of(weights.padded, image, normalisers(weights.padded)), background, 10)
     index, light = find_peaks(rest, boxes_of(camera.scale(water), weights.grid.spacing_mm))
     px, py, pz = weights.padding_xyz
     np.testing.assert_allclose(index[0], (7 + px, 7 + py, 2 + pz), atol=0.3)

@@ -42,7 +42,7 @@ from lfpiv_cli.particles.least_squares import (
 from lfpiv_cli.particles.search import SAME_DEPTHS, SAME_LENSES, State, Task, observed
 from lfpiv_cli.particles.suspects import good_chi2
 from lfpiv_cli.particles.view import footprint_radius_mm, over_tiles
-from lfpiv_cli.reconstruction.solvers import Normalisers, Problem, em_step, uniform_start
+from lfpiv_cli.reconstruction.solvers import Problem, em_step, uniform_start
 from lfpiv_cli.weights.model import Weights
 
 # Where particles may be: peaks of a volume that explains what the particles found so far do not.
@@ -83,10 +83,8 @@ def boxes_of(scale: Scale, spacing_mm: tuple[float, float, float]) -> Boxes:
 
 
 def explain_rest(
-    weights: Weights,
-    image: NDArray[np.float32],
+    problem: Problem,
     background: NDArray[np.float32],
-    sums: Normalisers,
     iterations: int,
     progress: Callable[[int], None] | None = None,
 ) -> NDArray[np.float32]:
@@ -94,15 +92,16 @@ def explain_rest(
 
     Parameters
     ----------
-    image, background : (rows, columns) in the weights' frame
-    sums : `normalisers` of the padded weights
+    problem : of the image, by the padded weights
+    background : (rows, columns) in the weights' frame, worked on
     """
-    operator = weights.padded
-    background = np.maximum(background, 0.0)
-    problem = Problem.of(operator, image, sums)
-    volume = uniform_start(Problem.of(operator, image - background, sums))
+    operator = problem.operator
+    np.maximum(background, 0.0, out=background)
+    volume = uniform_start(Problem.of(operator, problem.image - background, problem.sums))
     for _ in range(iterations):
-        volume = em_step(problem, volume, operator.forward(volume) + background, 1.0)
+        projection = operator.forward(volume)
+        projection += background
+        volume = em_step(problem, volume, projection, 1.0)
         if progress:
             progress(1)
     return volume

@@ -190,7 +190,11 @@ def beside_neighbours(residual: Floats, columns: int) -> Floats:
     """
     left = residual.reshape(-1, columns)
     beside = np.zeros_like(left)
-    beside[:, 1:-1] = (2.0 * left[:, 1:-1] - left[:, :-2] - left[:, 2:]) / np.sqrt(6.0)
+    inner = beside[:, 1:-1]
+    np.multiply(left[:, 1:-1], 2.0, out=inner)
+    inner -= left[:, :-2]
+    inner -= left[:, 2:]
+    inner /= np.sqrt(6.0)
     return beside.ravel()
 
 

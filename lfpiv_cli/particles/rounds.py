@@ -268,7 +268,7 @@ def candidates_of(
     """Return candidates (n, 4), brightest first, and their light (n,)."""
     model = (task.image - state.residual).reshape(task.prepared.shape).astype(np.float32)
     background = task.weights.prepare(model)
-    volume = explain_rest(task.weights, task.prepared, background, task.sums, iterations, progress)
+    volume = explain_rest(task.problem, background, iterations, progress)
     index, light = find_peaks(volume, boxes_of(task.view.scale, task.weights.grid.spacing_mm))
     points = task.camera.to_image_axes(points_in_raw_frame(task.weights, index))
     points = places_by_snell(points, task.view)

@@ -28,7 +28,7 @@ from lfpiv_cli.particles.noise import (
     read_noise,
 )
 from lfpiv_cli.particles.view import View, footprint_radius_mm, lens_pixels, on_array_mm
-from lfpiv_cli.reconstruction.solvers import Normalisers
+from lfpiv_cli.reconstruction.solvers import Normalisers, Problem
 from lfpiv_cli.weights.model import Weights
 
 # Active sets: which particles the next sweep fits again, because their last fit or neighbours' fits changed
@@ -135,6 +135,11 @@ class Task:
     def light(self) -> Floats:
         """The tracers' light (rows * columns,): the image without haze."""
         return self.image if self.haze is None else self.image - self.haze
+
+    @cached_property
+    def problem(self) -> Problem:
+        """What a volume is to explain of the image."""
+        return Problem.of(self.weights.padded, self.prepared, self.sums)
 
     @cached_property
     def least_light(self) -> float:

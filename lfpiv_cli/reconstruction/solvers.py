@@ -95,7 +95,9 @@ class Problem:
     def of(cls, operator: Operator, image: Image, sums: Normalisers) -> Problem:
         """Return the problem of an image whose noise may be negative and whose pixels may not all take part."""
         taking_part = sums.inverse_row_sum > 0.0
-        return cls(operator, np.where(taking_part, np.maximum(image, 0.0), 0.0).astype(np.float32), sums)
+        lit = np.maximum(image, 0.0, dtype=np.float32)
+        lit[~taking_part] = 0.0
+        return cls(operator, lit, sums)
 
 
 def normalisers(operator: Operator, excluded: Flags | None = None) -> Normalisers:
@@ -301,10 +303,12 @@ def em_step(problem: Problem, volume: Volume, projection: Image, relaxation: flo
     """
     image, missing = problem.image, np.empty(problem.image.shape, np.float32)
     share_out(write_ratio, len(image), image, projection, problem.sums.inverse_row_sum, missing)
-    factor = problem.operator.adjoint(missing) * problem.sums.inverse_column_sum
+    factor = problem.operator.adjoint(missing)
+    factor *= problem.sums.inverse_column_sum
     if relaxation != 1.0:
         factor **= np.float32(relaxation)
-    return volume * factor
+    factor *= volume
+    return factor
 
 
 def smart_step(problem: Problem, volume: Volume, projection: Image, relaxation: float) -> Volume:
