@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -18,14 +18,16 @@ from scipy import ndimage
 from lfpiv_cli.arrays import EVERYWHERE, Flags, Floats, Integers, Singles
 from lfpiv_cli.calibration.lattice import EXPONENTS, LatticeFit
 from lfpiv_cli.errors import InputError
-from lfpiv_cli.kernels import njit
+from lfpiv_cli.kernels import COUNT_NO_REFERENCES, njit
 from lfpiv_cli.names import ColumnAxis
 from lfpiv_cli.optics.camera import Lattice, nearest_point
 from lfpiv_cli.optics.line_responses import spline_weights
-from lfpiv_cli.threads import share_out
+from lfpiv_cli.threads import blocks, in_threads, share_out
 
 # A pixel counts in the coefficients of a cubic spline so far away by less than rounding of single precision.
 SPLINE_REACH_PX = 16
+# Lines of an image that a thread filters at a time.
+LINES = 512
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,7 +97,7 @@ class Rectification:
         inside[window] = self.inside[window]
         ranges = [range(*each.indices(size)) for each, size in zip(window, self.image_shape, strict=True)]
         part = tuple([slice(max(each.start - self._reach_px, 0), each.stop + self._reach_px) for each in ranges])
-        coefficients = ndimage.spline_filter(raw[part], order=3, mode="mirror")
+        coefficients = _spline_filtered(raw[part])
         shift, sampled = np.ascontiguousarray(self.shift_px[part]), np.zeros(coefficients.shape, np.float32)
         share_out(sample_rows, len(sampled), coefficients, shift, np.ascontiguousarray(inside[part]), sampled)
         rectified = np.zeros(self.image_shape, np.float32)
@@ -173,6 +175,20 @@ def write_shift(
             shift[row, column, 1] = y - row
 
 
+def _spline_filtered(image: Floats) -> Floats:
+    """Return the coefficients of an image's cubic spline, mirrored at its edges, lines shared out to threads."""
+    filtered = np.empty_like(image)
+    for axis, source in enumerate((image, filtered)):
+        lines = [(np.s_[:], part) if axis == 0 else (part, np.s_[:]) for part in blocks(image.shape[1 - axis], LINES)]
+        in_threads(partial(_filter_lines, source, filtered, axis), lines)
+    return filtered
+
+
+def _filter_lines(source: Floats, filtered: Floats, axis: int, lines: tuple[slice, slice]) -> None:
+    """Filter some lines of an image along an axis."""
+    ndimage.spline_filter1d(source[lines], order=3, axis=axis, output=filtered[lines], mode="mirror")
+
+
 @njit(cache=True)
 def mirrored(index: int, size: int) -> int:
     """Return the sample that stands for one beyond the ends: the image mirrored about its first and last pixel."""
@@ -183,7 +199,7 @@ def mirrored(index: int, size: int) -> int:
     return index
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, **COUNT_NO_REFERENCES)
 def sample_rows(part: tuple[int, int], coefficients: Floats, shift: Singles, inside: Flags, image: Singles) -> None:
     """Write rows `part` of a cubic spline at each pixel's place plus its shift, where inside."""
     rows, columns = coefficients.shape
@@ -197,10 +213,16 @@ def sample_rows(part: tuple[int, int], coefficients: Floats, shift: Singles, ins
                 across = spline_weights(x - left)
                 down = spline_weights(y - top)
                 total = 0.0
-                for m in range(4):
-                    line = coefficients[mirrored(top + m - 1, rows)]
-                    across_line = 0.0
-                    for n in range(4):
-                        across_line += across[n] * line[mirrored(left + n - 1, columns)]
-                    total += down[m] * across_line
+                if 1 <= left < columns - 2 and 1 <= top < rows - 2:
+                    for m in range(4):
+                        line = coefficients[top + m - 1, left - 1 : left + 3]
+                        in_line = across[0] * line[0] + across[1] * line[1] + across[2] * line[2] + across[3] * line[3]
+                        total += down[m] * in_line
+                else:
+                    for m in range(4):
+                        line = coefficients[mirrored(top + m - 1, rows)]
+                        in_line = 0.0
+                        for n in range(4):
+                            in_line += across[n] * line[mirrored(left + n - 1, columns)]
+                        total += down[m] * in_line
                 image[row, column] = total
