@@ -123,7 +123,7 @@ def respond_by_lines(view: View, bend: Bend, z: float, pixels: NDArray[np.int32]
             if of_x.number > 0 and of_y.number > 0 and count + of_x.number * of_y.number <= pixels.size:
                 responses = of_columns[i - low_i], of_rows[j - low_j]
                 number = _write_lens(view, projection, (of_x, of_y), responses, room, pixels[count:], values[:, count:])
-                _add_moved(view, projection, oblique, (s_x, s_y), pixels[count : count + number], values[:, count:])
+                _add_moved(view, projection, oblique, (s_x, s_y), (of_x, of_y), room.lit, values[:, count:])
                 count += number
     return count
 
@@ -332,14 +332,15 @@ def _write_lens(
     return count
 
 
-@njit(cache=True, **COUNT_NO_REFERENCES)
+@njit(cache=True, error_model="numpy", fastmath={"contract"}, **COUNT_NO_REFERENCES)
 def _add_moved(
     view: View,
     projection: Projection,
     oblique: Oblique,
     lens_mm: tuple[float, float],
-    pixels: NDArray[np.int32],
-    values: NDArray[np.float64],
+    cells: tuple[Cell, Cell],
+    lit: NDArray[np.int64],
+    values: Lines,
 ) -> None:
     """Add what coma moves of a lens's light, and where the sides of its cell lean, to first order.
 
@@ -350,27 +351,39 @@ def _add_moved(
     (x_xx, x_yy, x_xy), (y_xx, y_yy, y_xy) = oblique.coma_x, oblique.coma_y
     if x_xx == 0.0 and y_yy == 0.0 and view.lean_x == 0.0 and view.lean_y == 0.0:
         return
-    camera, x, y, (s_x, s_y) = view.camera, projection.x, projection.y, lens_mm
-    radius = camera.aperture_radius_mm
+    camera, x, y, (s_x, s_y), (of_x, of_y) = view.camera, projection.x, projection.y, lens_mm, cells
+    radius, single = camera.aperture_radius_mm, np.float32
     low_x, high_x = part_of_lens(x.stretch * x.alpha, x.at - s_x, x.half, radius)
     low_y, high_y = part_of_lens(y.stretch * y.alpha, y.at - s_y, y.half, radius)
     own = 1.0 - 0.125 * (max(high_x - low_x, 0.0) + max(high_y - low_y, 0.0)) / radius
     shift_x = (1.0 - camera.bend) * s_x - x.lever * x.beta * x.x
     shift_y = (1.0 - camera.bend) * s_y - y.lever * y.beta * y.x
-    # From derivatives by x and y to those by the place on the array.
-    per_x, per_y, per_radius = -1.0 / x.beta, -1.0 / y.beta, 1.0 / radius
-    for n in range(pixels.size):
-        row, column = pixels[n] // camera.columns, pixels[n] % camera.columns
-        at_x = ((column + 0.5 - 0.5 * camera.columns) * camera.pixel_mm - shift_x) / x.scale
-        at_y = ((row + 0.5 - 0.5 * camera.rows) * camera.pixel_mm - shift_y) / y.scale
-        at_x, at_y = min(max(at_x, low_x), high_x) * per_radius, min(max(at_y, low_y), high_y) * per_radius
-        # What diffraction spreads beyond the aperture's image is of its rim.
-        within = 1.0 / max(np.sqrt(at_x * at_x + at_y * at_y), 1.0)
-        at_x, at_y = within * at_x, within * at_y
-        further_x = at_x * (x_xx * at_x + x_xy * at_y) + x_yy * at_y * at_y - oblique.further_x
-        further_y = at_x * (y_xx * at_x + y_xy * at_y) + y_yy * at_y * at_y - oblique.further_y
-        # How far up in its cell the lens shows the ball is by how much the sides are further right there.
-        further_x = own * further_x + view.lean_x * (y.at - s_y + y.stretch * y.alpha * radius * at_y)
-        further_y = own * further_y + view.lean_y * (x.at - s_x + x.stretch * x.alpha * radius * at_x)
-        moved = further_x * per_x * values[1, n] + further_y * per_y * values[2, n]
-        values[0, n] = max(values[0, n] + moved, 0.0)
+    # In radii of the aperture: the place of the first column of the cell, and the step to the next.
+    step_x, step_y = camera.pixel_mm / (x.scale * radius), camera.pixel_mm / (y.scale * radius)
+    first_x = (of_x.first + 0.5 - 0.5 * camera.columns) * step_x - shift_x / (x.scale * radius)
+    first_y = (of_y.first + 0.5 - 0.5 * camera.rows) * step_y - shift_y / (y.scale * radius)
+    # From derivatives by x and y to those by the place on the array. How far up in its cell the lens shows the ball is
+    # by how much the sides are further right there.
+    per_x, per_y = -1.0 / x.beta, -1.0 / y.beta
+    to_x, to_y = own * per_x, own * per_y
+    up, right = view.lean_x * y.stretch * y.alpha * radius, view.lean_y * x.stretch * x.alpha * radius
+    whole_x = single(per_x * view.lean_x * (y.at - s_y) - to_x * oblique.further_x)
+    whole_y = single(per_y * view.lean_y * (x.at - s_x) - to_y * oblique.further_y)
+    a_xx, a_yy, a_xy, a_y = single(to_x * x_xx), single(to_x * x_yy), single(to_x * x_xy), single(per_x * up)
+    b_xx, b_yy, b_xy, b_x = single(to_y * y_xx), single(to_y * y_yy), single(to_y * y_xy), single(per_y * right)
+    low, high, step, one, none = single(low_x / radius), single(high_x / radius), single(step_x), single(1), single(0)
+    begin = 0
+    for m in range(of_y.number):
+        number, row = lit[m, 1], min(max(first_y + m * step_y, low_y / radius), high_y / radius)
+        first, v = single(first_x + lit[m, 0] * step_x), single(row)
+        light = values[0, begin : begin + number]
+        by_x, by_y = values[1, begin : begin + number], values[2, begin : begin + number]
+        for n in range(number):
+            u = min(max(first + single(n) * step, low), high)
+            # What diffraction spreads beyond the aperture's image is of its rim.
+            within = one / max(np.sqrt(u * u + v * v), one)
+            at_x, at_y = within * u, within * v
+            moved_x = at_x * (a_xx * at_x + a_xy * at_y) + at_y * (a_yy * at_y + a_y) + whole_x
+            moved_y = at_x * (b_xx * at_x + b_xy * at_y + b_x) + b_yy * at_y * at_y + whole_y
+            light[n] = max(light[n] + moved_x * by_x[n] + moved_y * by_y[n], none)
+        begin += number
