@@ -78,10 +78,12 @@ def begun(task: Task, tracers: Floats) -> State:
 
 @pytest.mark.thorough
 def test_read_noise_is_that_of_pixels_that_are_read(task: Task) -> None:
-    counts, usable = np.rint(np.random.default_rng(6).normal(0.0, 2.0, task.image.size)), np.ones(task.image.size, bool)
+    shape = task.view.camera.rows, task.view.camera.columns
+    counts, excluded = np.rint(np.random.default_rng(6).normal(0.0, 2.0, shape)), np.zeros(shape, bool)
     # The gap of a pixel that is left out is filled from those around it.
-    counts[7], usable[7] = -0.37, False
-    assert replace(task, image=counts, usable=usable).read_counts == pytest.approx(2.0, rel=0.03)
+    counts[0, 7], excluded[0, 7] = -0.37, True
+    made = search.task_of(counts, task.view, task.weights, task.camera, task.sums, excluded)
+    assert made.read_counts == pytest.approx(2.0, rel=0.03)
 
 
 @pytest.mark.thorough

@@ -108,7 +108,8 @@ class Task:
     view : the raw image's optics
     image : (rows * columns,) dark-subtracted counts
     usable : (rows * columns,) which pixels take part
-    prepared : (rows, columns) the same in the weights' frame
+    read_counts : the read noise of those, which of whole counts what fills gaps is not
+    prepared : (rows, columns) the image in the weights' frame
     depths_mm : between which particles may lie
     photons_per_count : of the camera; None: not known
     light_covariance : (2, 2) of the squares of size and diffusion, see `diffusion`; None: both are right
@@ -123,6 +124,7 @@ class Task:
     sums: Normalisers
     image: Floats
     usable: NDArray[np.bool_]
+    read_counts: float
     prepared: NDArray[np.float32]
     depths_mm: tuple[float, float]
     photons_per_count: float | None = None
@@ -151,11 +153,6 @@ class Task:
     def least_brightest(self) -> float:
         """The counts below which a particle's brightest pixel may be rounding's; 0 where noise hides its steps."""
         return LEAST_OF_QUIET if self.read_counts <= ROUNDING_COUNTS else 0.0
-
-    @cached_property
-    def read_counts(self) -> float:
-        """The image's read noise, which every step asks for: of whole counts, which what fills gaps is not."""
-        return read_noise(self.image[self.usable])
 
 
 class Fits(NamedTuple):
@@ -233,13 +230,16 @@ def task_of(
     haze, haze_error : (rows, columns) in the image, and see `Task`; None: nothing
     """
     in_image, error = (None if light is None else light.astype(np.float64).ravel() for light in (haze, haze_error))
+    counts = np.ascontiguousarray(image, dtype=np.float64).ravel()
+    usable = np.ones(image.size, np.bool_) if excluded is None else ~excluded.ravel()
     return Task(
         view,
         weights,
         camera,
         sums,
-        np.ascontiguousarray(image, dtype=np.float64).ravel(),
-        np.ones(image.size, np.bool_) if excluded is None else ~excluded.ravel(),
+        counts,
+        usable,
+        read_noise(counts[usable]),
         weights.prepare(image.astype(np.float32)),
         _depths_mm(view, *weights.grid.bounds_mm(2)),
         photons_per_count,
