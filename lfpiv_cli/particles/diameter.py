@@ -71,8 +71,8 @@ WIDE, NARROW, SMALLEST_STEP = (0.25, 0.1), (0.06, 0.04, 0.03), 0.03
 # A diameter that grows beyond is that of no tracer: of light that crowds, balls as wide as all of it explain most.
 LARGEST = 1.5 * FIRST_DIAMETERS[-1]
 # So many candidates around the middle of all are enough, and all others only take time. They are sought first within
-# this share of the volume's shorter side.
-MOST_CANDIDATES, PART = 400, 0.2
+# this share of the volume's shorter side, where that has at least this share of the light that all of the image has.
+MOST_CANDIDATES, PART, LIT = 400, 0.2, 0.7
 # Parabolas are believed up to so many times as far from the middle as sizes were tried.
 FURTHEST = 2.0
 # Tracers that are fitted with all sizes. A candidate's light lies apart where it is most of the light around it.
@@ -210,23 +210,27 @@ def measured_sizes(task: Task, diameter: float | None = None) -> Sizes:
     """Return what the tracers of an image show of their sizes; `task` may be of any size.
 
     Where a `diameter` is given, or known by another image, the search begins with it; it may still lead to another
-    one. The middle of the volume is looked at first, which takes a tenth of the time, and all of it where too few
-    tracers are there.
+    one. The middle of the volume is looked at alone where it is lit and has enough candidates, which takes a tenth of
+    the time.
     """
     ends = np.array([task.weights.grid.bounds_mm(axis) for axis in range(2)])
     middle = Region(task.camera.to_image_axes(ends.mean(axis=1)), PART * float(np.diff(ends).min()))
     part = _about(task, middle)
-    if part is not task:
-        sizes = _sizes_in(part, middle, diameter)
-        if sizes.square.size >= ENOUGH:
-            return sizes
-    return _sizes_in(task, Region(middle.middle_mm, np.inf), diameter)
+    if part is not task and task.prepared[part.weights.window].mean() > LIT * task.prepared.mean():
+        candidates = _first_candidates(part, middle)
+        if len(candidates) >= MOST_CANDIDATES:
+            return _sizes_of(part, candidates, diameter)
+    return _sizes_of(task, _first_candidates(task, Region(middle.middle_mm, np.inf)), diameter)
 
 
-def _sizes_in(task: Task, within: Region, diameter: float | None) -> Sizes:
-    """Return `measured_sizes` by the candidates in the middle of a part of the volume."""
+def _first_candidates(task: Task, within: Region) -> NDArray[np.float64]:
+    """Return the candidates (n, 4) of the first round in a part of the image."""
     candidates, _ = candidates_of(task, blank(task), ROUNDS[0].iterations, None)
-    candidates = candidates[within.holds(candidates)]
+    return candidates[within.holds(candidates)]
+
+
+def _sizes_of(task: Task, candidates: NDArray[np.float64], diameter: float | None) -> Sizes:
+    """Return `measured_sizes` by the first candidates (n, 4), those in their middle where they are many."""
     region = Region(np.zeros(2), 0.0)
     if len(candidates):
         middle = np.median(candidates[:, :2], axis=0)
