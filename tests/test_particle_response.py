@@ -213,20 +213,6 @@ def test_rows_are_the_pixels_one_by_one(any_view: View, place: tuple[float, floa
     assert np.isin(np.flatnonzero(lit), np.unique(named, return_index=True)[1]).all()
 
 
-@pytest.mark.thorough
-@pytest.mark.parametrize("place", ALL_PLACES)
-def test_each_pixel_has_the_share_that_passes_to_it(any_view: View, place: tuple[float, float, float]) -> None:
-    """As in the corner of a sensor of Table 2, to which half of the light of its middle passes."""
-    row, column = np.indices((any_view.camera.rows, any_view.camera.columns))
-    passed = 1.0 - 0.25 * (((column + 776) / 1176) ** 2 + ((row + 524) / 884) ** 2)
-    through = any_view._replace(passed=passed.astype(np.float32).ravel())
-    expected, found = rows_image(any_view, place) * passed.reshape(-1, 1), rows_image(through, place)
-    # Along rows and along columns it is right, and along both at once to second order.
-    assert np.all(np.abs(found - expected).sum(axis=0) < 4e-4 * np.abs(expected).sum(axis=0))
-    # A thousandth of a voxel's width, next to focus where a place in a lens is hardly known; 5e-6 elsewhere.
-    assert np.all(fit_moved(expected, found[:, 0]) < (1e-4, 1e-4, 2e-4))
-
-
 def test_weights_of_pixels_are_those_of_the_noise(rng: np.random.Generator) -> None:
     noise = Noise(5.0, 0.7, 0.03, 20.0)
     image, residual = rng.normal(100.0, 90.0, 500), rng.normal(0.0, 60.0, 500)

@@ -415,8 +415,7 @@ def _respond_by_rays(view: View, members: Floats, responses: Responses) -> None:
         pixels, values = responses.pixels[m], responses.values[m]
         bend = bend_of(view, members[m, 0], members[m, 1], members[m, 2], responses.rays)
         responses.counts[m] = respond_rows(view, bend, pixels, values, responses.scratch)
-        if view.cell_table.shape[0] > 0:
-            _pass(view.passed, pixels[: responses.counts[m]], values, responses.passed)
+        _pass(view.passed, pixels[: responses.counts[m]], values, responses.passed)
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)

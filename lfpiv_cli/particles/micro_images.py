@@ -37,13 +37,12 @@ DENSE, MOMENT = np.float32(0.75), np.float32(0.1875)
 # the mean's by x, and where what is seen of the ball is seen from; the patch's middle, by how much the middle of the
 # main lens shows the ball off the lens, what the profile was moved by for bent rays, how much further the lens stands
 # along the other axis, how far from the axis the patch lies, or its twin (`rows`) where that is nearer, by how much
-# profiles along the other axis are moved, over their derivative by x or y, `set_furthest`, and what share of the light
-# passes to this column, or row.
+# profiles along the other axis are moved, over their derivative by x or y, and `set_furthest`.
 MEAN, SLOPE, MEAN_X, SLOPE_X, MEAN_Z, SLOPE_Z, MEAN_XX, MEAN_XZ, SEEN_FROM = (row * STRIDE for row in range(9))
-PATCH, OFFSET, MOVED, DRIFT, AWAY, LEAN, FURTHEST, PASSED = (row * STRIDE for row in range(9, 17))
+PATCH, OFFSET, MOVED, DRIFT, AWAY, LEAN, FURTHEST = (row * STRIDE for row in range(9, 16))
 # In the table: the profile along x; of a row of pixels light and its derivatives; the profile along y.
-SHOWN, DOWN = 17 * STRIDE, 21 * STRIDE
-TABLE_SIZE = 38 * STRIDE
+SHOWN, DOWN = 16 * STRIDE, 20 * STRIDE
+TABLE_SIZE = 36 * STRIDE
 # Of a ball; what sees less sees nothing.
 SMALLEST_SHARE = np.float32(1e-9)
 # What the rim leaves of a patch that it does not touch: all; see `cells.covered_share`.
@@ -405,12 +404,11 @@ def _join_curved(
 def take_row(
     table: Singles,
     columns: tuple[int, int],
-    row: int,
     to: tuple[int, NDArray[np.int64], int],
     pixels: NDArray[np.int32],
     values: Singles,
 ) -> None:
-    """Write what passes of what `join_row` filled in to the entries from a number on.
+    """Write what `join_row` filled in to the entries from a number on.
 
     `to` is this number, the columns' pixels in a row, and the flat number of the row's first pixel.
     """
@@ -418,9 +416,8 @@ def take_row(
     named, placed = pixels[at : at + count], places[first : first + count]
     for n in range(count):
         named[n] = pixel + placed[n]
-    passed, to_row = table[PASSED + first : PASSED + first + count], table[DOWN + PASSED + row]
     for k in range(values.shape[0]):
         source = table[SHOWN + k * STRIDE + first : SHOWN + k * STRIDE + first + count]
         target = values[k, at : at + count]
         for n in range(count):
-            target[n] = source[n] * (passed[n] * to_row)
+            target[n] = source[n]

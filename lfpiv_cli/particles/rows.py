@@ -24,7 +24,6 @@ from lfpiv_cli.particles.micro_images import (
     LONGEST,
     MOVED,
     OFFSET,
-    PASSED,
     PATCH,
     SHOWN,
     STRIDE,
@@ -495,7 +494,6 @@ def _write_rows(
         of_curved = _curved(view, projection, bend, bent)
     else:
         of_plane = _plane(view, projection, bend)
-    _set_passed(view, lines, rows, columns, table)
     at, twice_lit = begin, _has_twins(room, AXES[0], columns)
     rectangle[1], rectangle[2], rectangle[3], rectangle[4] = camera.rows, -1, camera.columns, -1
     for m in range(rows):
@@ -513,7 +511,7 @@ def _write_rows(
         if twice_lit:
             _join_twin_columns(table, lines[TWIN[0]], low, high)
         row = lines[PLACE[1], m]
-        take_row(table, chosen, m, (at, lines[PLACE[0]], row * camera.columns), pixels, values)
+        take_row(table, chosen, (at, lines[PLACE[0]], row * camera.columns), pixels, values)
         at += high - low
         for earlier in range(lines[TWIN[1], m], m if lines[TWIN[1], m] >= 0 else -1):
             if lines[PLACE[1], earlier] == row:
@@ -521,22 +519,6 @@ def _write_rows(
         rectangle[1], rectangle[2] = min(rectangle[1], row), max(rectangle[2], row)
         rectangle[3], rectangle[4] = min(rectangle[3], lines[0, low]), max(rectangle[4], lines[0, high - 1])
     return at - begin
-
-
-@njit(**IN_PLACE)
-def _set_passed(view: View, lines: NDArray[np.int64], rows: int, columns: int, table: Singles) -> None:
-    """Set what share of the light passes to columns, as in the middle row, and to rows over that.
-
-    It changes smoothly over the sensor, and is nearly a product there: where it is half of the middle's in the corners,
-    4e-4 of a particle's light is elsewhere.
-    """
-    passed, width = view.passed, view.camera.columns
-    middle, place = lines[PLACE[1], rows // 2] * width, lines[PLACE[0], columns // 2]
-    for n in range(columns):
-        table[PASSED + n] = passed[middle + lines[PLACE[0], n]] if passed.size > 0 else 1.0
-    for m in range(rows):
-        to_row = passed[lines[PLACE[1], m] * width + place] / passed[middle + place] if passed.size > 0 else 1.0
-        table[DOWN + PASSED + m] = to_row
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
