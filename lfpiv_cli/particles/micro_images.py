@@ -48,7 +48,8 @@ SMALLEST_SHARE = np.float32(1e-9)
 # What the rim leaves of a patch that it does not touch: all; see `cells.covered_share`.
 WHOLE = (ONE, ZERO, ZERO, ZERO, ZERO)
 
-# No fastmath: a kernel is optimised again in each that calls it, and in another order its sums have other last digits.
+# Of fastmath nothing but fused products and sums: a kernel is optimised again in each that calls it, and in another
+# order its sums would have other last digits. Fits take it by one address.
 VECTORISED: dict[str, Any] = {"cache": True, "error_model": "numpy", "fastmath": {"contract"}, **COUNT_NO_REFERENCES}
 Four: TypeAlias = tuple[Real, Real, Real, Real]
 
