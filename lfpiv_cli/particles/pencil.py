@@ -87,32 +87,31 @@ def room_for_pencil() -> Pencil:
 def set_pencil(faces: Faces, radius: float, x: float, y: float, z: float, pencil: Pencil) -> None:
     """Fill in the rays of a point over a main lens of that radius."""
     line, line_moves, cubic, slopes = pencil
-    seen = _sum_rays(faces, radius, (x, y, z), pencil) and line[0, 1] > 0.0 and line[1, 1] > 0.0
+    _clear(pencil)
+    if not (_sum_rays(faces, radius, (x, y, z), pencil) and line[0, 1] > 0.0 and line[1, 1] > 0.0):
+        _clear(pencil)
+        return
     for k in range(2):
-        if seen:
-            _set_cubic(slopes[:, k], radius, line[k, 0], line[k, 1], k, cubic[k])
-            _set_line(line[k], line_moves[k])
-        else:
-            _clear(line[k : k + 1])
-            _clear(line_moves[k])
-            _clear(cubic[k : k + 1])
+        _set_cubic(slopes[:, k], radius, line[k, 0], line[k, 1], k, cubic[k])
+        _set_line(line[k], line_moves[k])
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
-def _clear(values: Floats) -> None:
-    """Fill an array (n, m) with 0."""
-    for row in range(values.shape[0]):
-        for column in range(values.shape[1]):
-            values[row, column] = 0.0
+def _clear(pencil: Pencil) -> None:
+    """Fill in 0: a point that is not seen."""
+    for k in range(2):
+        for m in range(2):
+            pencil.line[k, m] = 0.0
+            for j in range(3):
+                pencil.line_moves[k, m, j] = 0.0
+        for term in range(TERMS):
+            pencil.cubic[k, term] = 0.0
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
 def _sum_rays(faces: Faces, radius: float, place: tuple[float, float, float], pencil: Pencil) -> bool:
-    """Fill in the slopes of a point's rays, their means and how they grow over the lens; return whether it is seen."""
+    """Add up the slopes of a point's rays, their means and how they grow over the lens; return whether it is seen."""
     (x, y, z), (line, line_moves, _, slopes) = place, pencil
-    for k in range(2):
-        _clear(line[k : k + 1])
-        _clear(line_moves[k])
     middle_x, middle_y, there = aim(faces, x, y, z, 0.0, 0.0)
     if not there:
         return False
