@@ -73,9 +73,9 @@ SURE_LENSES, SURE_DEPTHS, SURE_LIGHT = 0.05, 0.05 / 1.064, 0.05
 HELD, FREE = (0.3, 0.1, 0.1), 0.05
 # The search of what particles leave that go on.
 SEARCHES = (
-    Round(12, 0.85, 0.1, thorough=True),
-    Round(8, 0.75, 0.07, thorough=True),
-    Round(6, 0.6, 0.05, thorough=True),
+    Round(8, 0.85, 0.1, thorough=True),
+    Round(5, 0.75, 0.07, thorough=True),
+    Round(4, 0.6, 0.05, thorough=True),
 )
 SWEEPS = 2
 # Where fewer than this share of them go on, the frame does not go on from the ones before.

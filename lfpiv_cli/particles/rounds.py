@@ -63,12 +63,12 @@ class Round:
 
 # As long as half the light is unexplained most particles fit badly, and verifying them all is in vain.
 ROUNDS = (
-    Round(20, 0.9, 0.3, thorough=False),
-    Round(12, 0.85, 0.2, thorough=False),
-    Round(12, 0.8, 0.1, thorough=True),
-    Round(8, 0.75, 0.07, thorough=True),
-    Round(6, 0.7, 0.05, thorough=True),
-    Round(6, 0.6, 0.05, thorough=True),
+    Round(13, 0.9, 0.3, thorough=False),
+    Round(8, 0.85, 0.2, thorough=False),
+    Round(8, 0.8, 0.1, thorough=True),
+    Round(5, 0.75, 0.07, thorough=True),
+    Round(4, 0.7, 0.05, thorough=True),
+    Round(4, 0.6, 0.05, thorough=True),
 )
 
 # A thorough round that finds no more than this share more is the last one; what follows looks for more anyway.

