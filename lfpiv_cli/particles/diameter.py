@@ -497,8 +497,9 @@ def _tried(task: Task, state: State, diameters: NDArray[np.float64], unexplained
     bright = _bright(state, seen)
     good = np.flatnonzero(bright)[np.argsort(chi2[bright], kind="stable")[:MOST_TRACERS]]
     tracers, change = state.particles[good], np.zeros((len(trials), good.size))
+    seen_by = observation.residual, observation.weight, task.depths_mm
     for number, trial in enumerate(trials):
-        sized = observed(_of_diameter(task, *trial), state, unexplained)._replace(residual=observation.residual)
+        sized = observation_of(_of_diameter(task, *trial).view, *seen_by)
         change[number], _ = _fitted(observation, sized, tracers, tracers[:, 2:3])
     losses = (change - change.min(axis=0)) / np.maximum(chi2[good], 1.0)
     noise_alone, *_ = judge(observed(task, with_measured_noise(task, state), 0.0), tracers)

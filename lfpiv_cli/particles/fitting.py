@@ -39,11 +39,9 @@ from lfpiv_cli.particles.least_squares import (
 from lfpiv_cli.particles.refraction import on_line_of_sight
 from lfpiv_cli.particles.view import View, entry_capacity, over_tiles, type_by_form
 
-# Candidates are brought into the fit from these depths beside their own, in depths over which light spreads by one lens
-# (Table 2: 0.4 mm).
-START_DEPTHS = np.array([-0.4, 0.0, 0.4]) / 1.064
-# Where light spreads by no more than so many lenses, fits reach a particle only from its own part of a lens: there a
-# candidate that does not hold begins again from so far beside it, in lenses.
+# Candidates begin at their own depth: from others beside it no more are found, and those near the focal plane, where
+# several hold, are tried at others later. Where light spreads by no more than so many lenses, fits reach a particle
+# only from its own part of a lens: there a candidate that does not hold begins again from so far beside it, in lenses.
 FEW_LENSES = 2.0
 START_BESIDE = 0.33 * np.array([(x, y) for x in (-1.0, 0.0, 1.0) for y in (-1.0, 0.0, 1.0) if x or y])
 # Steps from each of these depths; from where that led in the best of them; for a particle in a sweep.
@@ -377,8 +375,7 @@ def accept(observation: Observation, candidates: Floats, least: Least) -> NDArra
     accepted, fitter = np.zeros(len(candidates), np.bool_), fitter_of(observation)
     choice = Choice(Effort(FIRST_STEPS, CHOICE_GAIN), Effort(CANDIDATE_STEPS, CHOICE_GAIN), 1, least.light, np.inf)
     scale = observation.optics.scale
-    depths = candidates[:, 2:3] + START_DEPTHS * scale.depth_mm
-    depths = np.clip(depths, observation.low_mm, observation.high_mm)
+    depths = np.clip(candidates[:, 2:3], observation.low_mm, observation.high_mm)
     beside = np.pad(START_BESIDE * scale.lens_mm, ((0, 0), (0, 2)))
     narrow = np.abs(candidates[:, 2]) < FEW_LENSES * scale.depth_mm
     arguments = fitter, candidates, choice, depths, beside, narrow, least, accepted
@@ -400,15 +397,15 @@ def _accept(
 ) -> None:
     """Do the work of `accept` for the candidates of a tile."""
     observation, _ = fitter.to
-    responses, best, count = room_for(1, observation.capacity, 0), np.empty((1, UNKNOWNS)), depths.shape[1]
-    starts = np.empty((len(beside) * count, 1, UNKNOWNS))
+    responses, best = room_for(1, observation.capacity, 0), np.empty((1, UNKNOWNS))
+    starts = np.empty((len(beside), 1, UNKNOWNS))
     for number in numbers:
-        begin_at(observation.optics, candidates[number], depths[number], starts[:count])
-        holds = _holds(fitter, starts[:count], responses, choice, least, best)
+        begin_at(observation.optics, candidates[number], depths[number], starts[:1])
+        holds = _holds(fitter, starts[:1], responses, choice, least, best)
         if narrow[number] and not holds:
             for k in range(len(beside)):
                 place = candidates[number] + beside[k]
-                begin_at(observation.optics, place, depths[number], starts[k * count : (k + 1) * count])
+                begin_at(observation.optics, place, depths[number], starts[k : k + 1])
             holds = _holds(fitter, starts, responses, choice, least, best)
         if holds:
             copy_rows(best, candidates[number : number + 1])

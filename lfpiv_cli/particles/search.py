@@ -279,12 +279,14 @@ def observed(task: Task, state: State, unexplained: float) -> Observation:
 def sweep(task: Task, state: State, unexplained: float, sweeps: int, enough: float = SMALLEST_GAIN) -> None:
     """Refine particles in place, the residual along with them; see `refine`.
 
-    The first sweep fits all, the others those whose last fit, or their neighbours' since, changed more than `enough`.
+    The first sweep fits all, the others those whose last fit, or their neighbours' since, changed more than `enough`,
+    to pixels that weigh what they did before the first.
     """
+    observation = observed(task, state, unexplained)
     overlaps = overlaps_of(task.view, state.particles) if sweeps > 1 else None
     active, disturbed, prior = np.ones(len(state.particles), np.bool_), np.zeros(len(state.particles)), state.prior
     for _ in range(sweeps):
-        gain = refine(observed(task, state, unexplained), state.particles, enough, active, prior)
+        gain = refine(observation, state.particles, enough, active, prior)
         if overlaps is not None:
             disturbed = np.where(active, 0.0, disturbed) + disturbance(overlaps, gain)
             active = (gain > enough) | (disturbed > DISTURBING * enough)
