@@ -2,8 +2,8 @@
 
 Each round explains what is left of the image by a volume, takes its peaks as candidates, fits and accepts those whose
 light is there, separates overlapping ones and refines all. Early rounds accept only what is plainly there and let
-unexplained light count for little; later ones ask for less, verify every particle that fits badly, and try other
-depths. Ghost particles find too little light and are pruned.
+unexplained light count for little; later ones ask for less and verify every particle that fits badly. What is found
+then is tried at other depths, too. Ghost particles find too little light and are pruned.
 
 Axes: see `search`.
 """
@@ -52,7 +52,7 @@ class Round:
     iterations : of expectation maximisation
     claimed_share : least share of its claimed light that a candidate must find
     unexplained : weight of light above the model in a pixel's variance
-    thorough : whether particles of usual brightness are suspects, too, and other depths tried
+    thorough : whether particles of usual brightness are suspects, too
     """
 
     iterations: int
@@ -165,8 +165,8 @@ def separated(task: Task, state: State, settings: Round, to_noise: bool) -> tupl
             state = accepted(task, state, candidates, replace(settings, unexplained=LAST_UNEXPLAINED))
             sweep(task, state, LAST_UNEXPLAINED, LAST_SWEEPS)
             found = len(state.particles) > before
-        # What could not be moved may be with the noise that is measured first, and what could not be split any time.
-        state = replace(state, unmoved=state.unmoved if check else state.unmoved[:0], unsplit=state.unsplit[:0])
+        # What could not be split may be any time.
+        state = replace(state, unsplit=state.unsplit[:0])
         fits = judged(task, state, LAST_UNEXPLAINED)
         good = good_chi2(fits.chi2)
         if to_noise and good > max(NEXT_TO_NOISE, LEAST_PROGRESS * good_before):
@@ -179,13 +179,10 @@ def separated(task: Task, state: State, settings: Round, to_noise: bool) -> tupl
     return state, good
 
 
-def with_suspects_tried(
-    task: Task, state: State, fits: Fits, unexplained: float, good: float, thorough: bool = True
-) -> State:
+def with_suspects_tried(task: Task, state: State, fits: Fits, unexplained: float, good: float) -> State:
     """Return the state after all that fit worse than `good` were tried as two, and before that at other depths."""
-    if thorough:
-        state = with_depths_corrected(task, state, fits.chi2, unexplained, good)
-    return with_overlaps_split(task, state, fits.chi2, unexplained, good, thorough)
+    state = with_depths_corrected(task, state, fits.chi2, unexplained, good)
+    return with_overlaps_split(task, state, fits.chi2, unexplained, good, thorough=True)
 
 
 def concluded(task: Task, state: State, settings: Round) -> State:
@@ -253,11 +250,13 @@ def first_typical_light(light: Floats, noise_counts: float) -> float:
 
 
 def with_suspects_checked(task: Task, state: State, fits: Fits, settings: Round) -> tuple[State, Fits]:
-    """Return the state after particles that fit badly were tried at other depths or as two, as far as a round does.
+    """Return the state after particles that fit badly were tried as two, as far as a round does.
 
-    `fits` says how well they fit; returned is how well those do that stay.
+    `fits` says how well they fit; returned is how well those do that stay. Other depths are tried when noise alone is
+    left: before, none more are found by them.
     """
-    state = with_suspects_tried(task, state, fits, settings.unexplained, good_chi2(fits.chi2), settings.thorough)
+    good = good_chi2(fits.chi2)
+    state = with_overlaps_split(task, state, fits.chi2, settings.unexplained, good, settings.thorough)
     sweep(task, state, settings.unexplained, SWEEPS_AFTER_SPLIT, SEARCH_GAIN)
     return pruned(task, with_twins_joined(task, state, settings.unexplained, fits.chi2), settings)
 
