@@ -282,7 +282,7 @@ def test_nearest_by_brute_force_and_by_the_kernel(layout, rng):
     assert found == pytest.approx(lattice.points(lattice.nearest(points[:500])), abs=1e-15)
     x, y = points[:30, 0], points[:20, 1]
     on_grid = nearest_on_grid(x.copy(), y.copy(), lattice.origin, lattice.basis)
-    assert np.array_equal(on_grid, lattice.nearest(np.stack(np.meshgrid(x, y), axis=-1)))
+    assert np.array_equal(np.moveaxis(on_grid, 0, -1), lattice.nearest(np.stack(np.meshgrid(x, y), axis=-1)))
 
 
 def test_coordinates_invert_points_that_transformed_and_scaled_lattices_move(layout, rng):

@@ -19,6 +19,7 @@ from lfpiv_cli.grid import Scale
 from lfpiv_cli.kernels import njit
 from lfpiv_cli.names import ColumnAxis, Layout
 from lfpiv_cli.optics.media import Media
+from lfpiv_cli.threads import share_out
 
 # Undoing r' = r (1 + k1 r^2) by repetition: each round gains a factor 3 k1 r^2, below 0.01 for usable lenses.
 UNDISTORT_ROUNDS = 6
@@ -131,15 +132,24 @@ def nearest_point(x: float, y: float, origin: Floats, basis: Floats) -> tuple[fl
     return origin[0] + (i * basis[0, 0] + j * basis[1, 0]), origin[1] + (i * basis[0, 1] + j * basis[1, 1])
 
 
-@njit(cache=True)
-def nearest_on_grid(x: Floats, y: Floats, origin: Floats, basis: Floats) -> NDArray[np.int32]:
-    """Return `Lattice.nearest` (rows, columns, 2) for all places that a grid's columns x and rows y make."""
-    found = np.empty((y.size, x.size, 2), np.int32)
-    for row in range(y.size):
+def nearest_on_grid(
+    x: NDArray[np.floating], y: NDArray[np.floating], origin: Floats, basis: NDArray[np.floating]
+) -> NDArray[np.int32]:
+    """Return `Lattice.nearest` (2, rows, columns) for all places that a grid's columns x and rows y make."""
+    found = np.empty((2, y.size, x.size), np.int32)
+    share_out(_write_nearest, y.size, x, y, origin, basis, found)
+    return found
+
+
+@njit(cache=True, nogil=True)
+def _write_nearest(
+    part: tuple[int, int], x: Floats, y: Floats, origin: Floats, basis: Floats, found: NDArray[np.int32]
+) -> None:
+    """Write rows `part` of `nearest_on_grid`."""
+    for row in range(part[0], part[1]):
         for column in range(x.size):
             i, j = nearest_index(x[column], y[row], origin, basis)
-            found[row, column, 0], found[row, column, 1] = int(i), int(j)
-    return found
+            found[0, row, column], found[1, row, column] = int(i), int(j)
 
 
 def undistorted(

@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
@@ -360,14 +361,15 @@ def _settled_sizes(sought: Sought, diameter: float, rounds: Sequence[Round], fir
         first = None
         for share in NARROW:
             diameters = _steps(diameter, share)
-            diameter, losses, alone = _tried(task, found, diameters, LAST_UNEXPLAINED)
+            trial = _tried(task, found, diameters, LAST_UNEXPLAINED)
+            diameter = trial.diameter
         # Where neighbours are missing everywhere, what explains most of their light is no tracer's size.
         settled = abs(diameter - searched_with) < max(NARROW[0] * searched_with, SMALLEST_STEP)
-        if settled or not alone.any():
+        if settled or not trial.alone.any():
             break
-    if not _enough(alone):
+    if not _enough(trial.alone):
         return NO_SIZES
-    sizes = _vertices(np.square(diameters), losses[:, alone])
+    sizes = _vertices(np.square(diameters), trial.losses[:, trial.alone])
     best = _tried(task, found, diameter * np.array([0.5, 1.0, 2.0]), LAST_UNEXPLAINED).diameter
     # Half of what is too small to be seen looks the same.
     unseen = best < diameter and (pooled := diameter_of([sizes])) is not None and not pooled.resolved
@@ -394,10 +396,10 @@ def _forms(task: Task, found: State, diameter: float) -> Forms:
         steps = np.array([SQUARE_STEPS[0] * middle[0] + SQUARE_STEPS[1], DIFFUSION_STEP])
         middle = np.maximum(middle, steps)
         squares = middle + steps * NINE
-        _, losses, alone = _tried(task, found, np.sqrt(squares), LAST_UNEXPLAINED)
-        if not _enough(alone):
+        trial = _tried(task, found, np.sqrt(squares), LAST_UNEXPLAINED)
+        if not _enough(trial.alone):
             break
-        forms = forms_of(squares, losses[:, alone])
+        forms = forms_of(squares, trial.losses[:, trial.alone])
         best = together_of([forms])
         moved = (np.square([best.lenses, best.diffusion_px]) - middle) / steps
         if np.all(np.abs(moved) < 1.0):
@@ -470,19 +472,29 @@ def _first_diameter(task: Task, state: State, apart: NDArray[np.float64]) -> tup
     return diameter, fits[FIRST_DIAMETERS.index(diameter)][1][real]
 
 
-class Trial(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Trial:
     """What bright tracers say of some diameters.
 
     Attributes
     ----------
     diameter : the one that they agree on
     losses : (m, n) of each with each, in chi-squared, in units of what is left of a tracer's own, at least 1
-    alone : (n,) whether noise is all that is left around a tracer
+    task, state : with the middle one
+    tracers : (n, 4)
     """
 
     diameter: float
     losses: NDArray[np.float64]
-    alone: NDArray[np.bool_]
+    task: Task
+    state: State
+    tracers: NDArray[np.float64]
+
+    @cached_property
+    def alone(self) -> NDArray[np.bool_]:
+        """Whether noise is all that is left around a tracer (n,)."""
+        noisy = with_measured_noise(self.task, self.state)
+        return judge(observed(self.task, noisy, 0.0), self.tracers)[0] <= NOISE_ALONE
 
 
 def _tried(task: Task, state: State, diameters: NDArray[np.float64], unexplained: float) -> Trial:
@@ -502,8 +514,7 @@ def _tried(task: Task, state: State, diameters: NDArray[np.float64], unexplained
         sized = observation_of(_of_diameter(task, *trial).view, *seen_by)
         change[number], _ = _fitted(observation, sized, tracers, tracers[:, 2:3])
     losses = (change - change.min(axis=0)) / np.maximum(chi2[good], 1.0)
-    noise_alone, *_ = judge(observed(task, with_measured_noise(task, state), 0.0), tracers)
-    return Trial(_common(trials[:, 0], losses), losses, noise_alone <= NOISE_ALONE)
+    return Trial(_common(trials[:, 0], losses), losses, task, state, tracers)
 
 
 def _bright(state: State, seen: NDArray[np.float64]) -> NDArray[np.bool_]:

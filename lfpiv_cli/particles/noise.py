@@ -141,7 +141,13 @@ def _at_lag(error: Floats, lit: NDArray[np.bool_], lag: int, axis: int) -> float
 
 
 def measured_noise(
-    model: Floats, residual: Floats, usable: NDArray[np.bool_], noise: Noise, *, rims: bool = False
+    model: Floats,
+    residual: Floats,
+    usable: NDArray[np.bool_],
+    noise: Noise,
+    columns: int | None = None,
+    *,
+    rims: bool = False,
 ) -> Noise:
     """Return noise whose gain and errors are those that a fit leaves of an image.
 
@@ -151,6 +157,7 @@ def measured_noise(
     ----------
     model, residual, usable : (pixels,)
     noise : taken for the read noise, and as it is where too little is lit
+    columns : of the image whose residual counts as `beside_neighbours` has it; None: as it is
     rims : whether edges of lens images have noise of their own; in crowds light that was not found looks like theirs
     """
     lit = np.flatnonzero(usable & (model > LIT_SIGMAS * noise.read_counts))
@@ -160,7 +167,7 @@ def measured_noise(
         return noise
     # Whole counts are spread over what was rounded to them: a median of few steps is one of these.
     spread = ROUNDING_COUNTS * np.sqrt(12.0) * ((GOLDEN * np.arange(lit.size)) % 1.0 - 0.5)
-    light, left = model[lit], residual[lit] + spread
+    light, left = model[lit], spread + (residual[lit] if columns is None else beside_neighbours(residual, lit, columns))
 
     # As many pixels in each class as may be. Where light fills a micro-image its pixels are alike but for rounding: it
     # must not tell where they belong, and classes that are left with few pixels by that say nothing.
@@ -183,19 +190,18 @@ def measured_noise(
     return Noise(noise.read_counts, float(gain), float(np.sqrt(error2)), float(np.sqrt(edge2)))
 
 
-def beside_neighbours(residual: Floats, columns: int) -> Floats:
-    """Return what pixels (rows * columns,) have beside the mean of both neighbours in their row, as large as noise is.
+def beside_neighbours(residual: Floats, pixels: NDArray[np.intp], columns: int) -> Floats:
+    """Return what some pixels (n,) have beside the mean of both neighbours in their row, as large as noise is.
 
-    Light that was not found is nearly alike in them, and noise is not.
+    Light that was not found is nearly alike in them, and noise is not. First and last of a row have nothing.
+
+    Parameters
+    ----------
+    residual : (rows * columns,)
     """
-    left = residual.reshape(-1, columns)
-    beside = np.zeros_like(left)
-    inner = beside[:, 1:-1]
-    np.multiply(left[:, 1:-1], 2.0, out=inner)
-    inner -= left[:, :-2]
-    inner -= left[:, 2:]
-    inner /= np.sqrt(6.0)
-    return beside.ravel()
+    left, right = (residual.take(pixels + step, mode="clip") for step in (-1, 1))
+    inner = (pixels % columns > 0) & (pixels % columns < columns - 1)
+    return np.where(inner, (2.0 * residual[pixels] - left - right) / np.sqrt(6.0), 0.0)
 
 
 def mean_whole(counts: Floats, sigma: Floats) -> Floats:

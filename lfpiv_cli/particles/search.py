@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from lfpiv_cli.arrays import Floats
+from lfpiv_cli.kernels import njit
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.particles.fitting import add_all, judge, nothing_expected, refine
 from lfpiv_cli.particles.least_squares import SMALLEST_GAIN, Observation, observation_of
@@ -22,7 +23,6 @@ from lfpiv_cli.particles.noise import (
     PHOTONS_PER_PARTICLE,
     ROUNDING_COUNTS,
     Noise,
-    beside_neighbours,
     measured_noise,
     pixel_weights,
     read_noise,
@@ -45,34 +45,37 @@ from lfpiv_cli.weights.model import Weights
 DISTURBING = 20.0
 
 
-class Overlaps(NamedTuple):
-    """Pairs of particles whose footprints overlap, and the share of a gain that the other of the two sees."""
+def disturbance(view: View, particles: Floats, gain: Floats) -> Floats:
+    """Return what each of particles (n, 4) sees of its neighbours' gains (n,).
 
-    first: NDArray[np.int64]
-    second: NDArray[np.int64]
-    share: Floats
-
-
-def overlaps_of(view: View, particles: Floats) -> Overlaps:
-    """Return which particles (n, 4) disturb each other: the more, the closer their middles and their radii are."""
+    The more of it, the closer their middles and their radii are.
+    """
     on_array = on_array_mm(view, particles)
     # Light that touches a lens's cell spreads over it.
     radius = footprint_radius_mm(view, particles) + 2.0 * max(view.half_x_mm, view.half_y_mm)
-    pairs = KDTree(on_array).query_pairs(2.0 * float(radius.max(initial=0.0)), output_type="ndarray")
-    first, second = pairs[:, 0].astype(np.int64), pairs[:, 1].astype(np.int64)
-    distance = np.hypot(*(on_array[first] - on_array[second]).T)
-    one, other = radius[first], radius[second]
-    near = np.maximum(1.0 - distance / (one + other), 0.0)
-    return Overlaps(first, second, (near * np.minimum(one, other) / np.maximum(one, other)) ** 2)
-
-
-def disturbance(overlaps: Overlaps, gain: Floats) -> Floats:
-    """Return what each particle (n,) sees of its neighbours' gains (n,)."""
-    first, second, share = overlaps
     seen = np.zeros(gain.size)
-    for one, other in ((first, second), (second, first)):
-        seen += np.bincount(one, share * gain[other], gain.size)
+    _add_seen(np.argsort(on_array[:, 0], kind="stable"), on_array, radius, float(radius.max(initial=0.0)), gain, seen)
     return seen
+
+
+@njit(cache=True)
+def _add_seen(
+    order: NDArray[np.int64], on_array: Floats, radius: Floats, widest: float, gain: Floats, seen: Floats
+) -> None:
+    """Add what particles in an order along x see of those that may overlap with them, none wider than `widest`."""
+    for place in range(order.size):
+        one = order[place]
+        for k in range(place + 1, order.size):
+            other = order[k]
+            x = on_array[other, 0] - on_array[one, 0]
+            if x > radius[one] + widest:
+                break
+            y, reach = on_array[other, 1] - on_array[one, 1], radius[one] + radius[other]
+            if x * x + y * y < reach * reach:
+                near = 1.0 - np.sqrt(x * x + y * y) / reach
+                share = (near * min(radius[one], radius[other]) / max(radius[one], radius[other])) ** 2
+                seen[one] += share * gain[other]
+                seen[other] += share * gain[one]
 
 
 # Sweeps at the end, where light that is not explained counts for little more than noise.
@@ -283,12 +286,11 @@ def sweep(task: Task, state: State, unexplained: float, sweeps: int, enough: flo
     to pixels that weigh what they did before the first.
     """
     observation = observed(task, state, unexplained)
-    overlaps = overlaps_of(task.view, state.particles) if sweeps > 1 else None
     active, disturbed, prior = np.ones(len(state.particles), np.bool_), np.zeros(len(state.particles)), state.prior
-    for _ in range(sweeps):
+    for number in range(sweeps):
         gain = refine(observation, state.particles, enough, active, prior)
-        if overlaps is not None:
-            disturbed = np.where(active, 0.0, disturbed) + disturbance(overlaps, gain)
+        if number < sweeps - 1:
+            disturbed = np.where(active, 0.0, disturbed) + disturbance(task.view, state.particles, gain)
             active = (gain > enough) | (disturbed > DISTURBING * enough)
 
 
@@ -362,8 +364,8 @@ def with_measured_noise(task: Task, state: State, *, rims: bool = False) -> Stat
     `rims` as in `measured_noise`.
     """
     assumed = replace(state.noise, read_counts=task.read_counts)
-    beside = beside_neighbours(state.residual, task.view.camera.columns)
-    noise = measured_noise(task.image - state.residual, beside, task.usable, assumed, rims=rims)
+    model, columns = task.image - state.residual, task.view.camera.columns
+    noise = measured_noise(model, state.residual, task.usable, assumed, columns, rims=rims)
     return replace(state, noise=noise)
 
 

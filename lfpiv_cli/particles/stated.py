@@ -26,7 +26,6 @@ from lfpiv_cli.particles.search import (
     Task,
     disturbance,
     observed,
-    overlaps_of,
     prune,
     rebuilt,
     sweep,
@@ -122,10 +121,9 @@ def missing_around(view: View, particles: Floats, chi2: Floats, known: NDArray[n
 
     What is missing may hide in noise in each of them, and shows in all together.
     """
-    overlaps, pixels = overlaps_of(view, particles), lens_pixels(view)
-    number = 1.0 + disturbance(overlaps, np.ones(len(particles)))
-    together = (chi2 + disturbance(overlaps, np.minimum(chi2, PLAIN_CHI2))) / number
-    light = particles[:, 3]
+    light, pixels = particles[:, 3], lens_pixels(view)
+    number = 1.0 + disturbance(view, particles, np.ones(len(particles)))
+    together = (chi2 + disturbance(view, particles, np.minimum(chi2, PLAIN_CHI2))) / number
     return np.maximum(missing_light(chi2, light, known, pixels), missing_light(together, light, known, pixels * number))
 
 

@@ -314,8 +314,9 @@ def lens_numbers(view: View) -> NDArray[np.int32]:
     camera = view.camera
     per_px = camera.pixel_mm / (1.0 + camera.microlens_distance_mm / camera.image_distance_mm)
     x, y = ((np.arange(n) - 0.5 * (n - 1)) * per_px for n in (camera.columns, camera.rows))
-    indices = nearest_on_grid(x, y, camera.origin_mm, np.linalg.inv(view.inverse_basis))
-    i, j = (indices - indices.min(axis=(0, 1))).transpose(2, 0, 1)
+    i, j = nearest_on_grid(x, y, camera.origin_mm, np.linalg.inv(view.inverse_basis))
+    i -= i.min()
+    j -= j.min()
     return np.asarray(j * (i.max() + 1) + i, np.int32)
 
 

@@ -81,11 +81,11 @@ class Lenses(NamedTuple):
     def of(cls, lattice_px: Lattice, image_shape: tuple[int, int]) -> Lenses:
         """Return them for an image (rows, columns) on a lattice of lens images (column, row)."""
         rows, columns = (np.arange(n, dtype=np.float64) for n in image_shape)
-        indices = nearest_on_grid(columns, rows, lattice_px.origin, lattice_px.basis).astype(np.int64)
-        least = indices.min(axis=(0, 1))
-        indices -= least
-        ni, nj = (int(n) + 1 for n in indices.max(axis=(0, 1)))
-        return cls((indices[..., 1] * ni + indices[..., 0]).ravel(), (nj, ni), least)
+        indices = nearest_on_grid(columns, rows, lattice_px.origin, lattice_px.basis).reshape(2, -1)
+        least = indices.min(axis=1).astype(np.int64)
+        i, j = indices - least[:, np.newaxis]
+        ni, nj = int(i.max()) + 1, int(j.max()) + 1
+        return cls(j * ni + i, (nj, ni), least)
 
     def sums(self, values: NDArray[Any]) -> Floats:
         """Return the sum of pixels' values over each microlens (nj, ni)."""

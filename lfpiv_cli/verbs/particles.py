@@ -297,7 +297,7 @@ def points_of(bench: Bench, frame: Frame, found: Particles, size: TracerSize, pr
     left_rms = float(np.sqrt(np.mean(left[~frame.unusable] ** 2)))
     noise = found.noise.of_dark(None if haze is None else haze.image[~frame.unusable].astype(np.float64))
     # Of four tracers for each microlens only 1.3 are found, and few of them are right. What noise leaves is no light.
-    beside = beside_neighbours(left, left.shape[1])[~frame.unusable.ravel()]
+    beside = beside_neighbours(left.ravel(), np.flatnonzero(~frame.unusable), left.shape[1])
     not_beside = max(1.0 - float(np.mean(beside**2)) / left_rms**2, 0.0) if left_rms > 0.0 else 0.0
     smooth = share_left * float(np.sqrt(not_beside))
     number = tracers_per_lens(bench, frame) if smooth > MUCH_LEFT else None
