@@ -213,7 +213,10 @@ def write_tiff(path: Path, array: NDArray[Any], overwrite: bool) -> None:
     """Write an image (rows, columns) of type uint8 or uint16, packed without loss and without time stamps."""
     if array.dtype not in (np.uint8, np.uint16, np.float32) or array.ndim != 2:
         raise TypeError(f"images are uint8, uint16 or float32 (rows, columns), not {array.dtype} {array.shape}")
-    kept = {"compression": "zlib", "predictor": array.dtype != np.float32, "metadata": None, "software": False}
+    # What is no count hardly packs: its lowest level takes half the time and 4 % more room.
+    fractions = array.dtype == np.float32
+    packing = {"compression": "zlib", "compressionargs": {"level": 1 if fractions else 6}, "predictor": not fractions}
+    kept = packing | {"metadata": None, "software": False}
     shape = (array.shape[0], array.shape[1])
     with written_atomically(
         path, overwrite=overwrite, check=lambda made: formats.tiff_frames(made).read_page(0, shape)

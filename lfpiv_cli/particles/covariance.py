@@ -105,7 +105,8 @@ def change_shown(observation: Observation, particles: Floats, change: Floats) ->
 
     By least squares with all of them free; 0 and infinite where they can make all of it.
     """
-    counts, pixel, slope = all_slopes(observation, particles)
+    start, row, column, slope = all_slopes(observation, particles)
+    pixel, counts = row.astype(np.int64) * observation.optics.camera.columns + column, np.diff(start)
     root, first = np.sqrt(observation.weight), UNKNOWNS * np.repeat(np.arange(len(counts)), counts)
     unknown = (first[:, np.newaxis] + np.arange(UNKNOWNS)).ravel()
     # Millimetres beside counts: columns of length one.

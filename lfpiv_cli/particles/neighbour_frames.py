@@ -26,6 +26,7 @@ from lfpiv_cli.particles.joining import with_twins_joined
 from lfpiv_cli.particles.least_squares import SEARCH_GAIN
 from lfpiv_cli.particles.rounds import (
     ROUNDS,
+    SWEEPS,
     Round,
     accepted,
     after_rounds,
@@ -77,7 +78,6 @@ SEARCHES = (
     Round(5, 0.75, 0.07, thorough=True),
     Round(4, 0.6, 0.05, thorough=True),
 )
-SWEEPS = 2
 # Where fewer than this share of them go on, the frame does not go on from the ones before.
 LEAST_FOUND = 0.3
 # Units of progress that `find_predicted` reports.

@@ -74,9 +74,7 @@ class Equations(NamedTuple):
 
 def equations_of(observation: Observation, particles: Floats) -> Equations:
     """Return the normal matrix of all particles."""
-    counts, pixel, slope = all_slopes(observation, particles)
-    row, column = np.divmod(pixel, observation.optics.camera.columns, dtype=np.int32)
-    slopes = Slopes(np.concatenate([[0], np.cumsum(counts)]), row, column, slope)
+    slopes = all_slopes(observation, particles)
 
     # Particles whose footprints may overlap: light that touches a lens's cell spreads over it.
     view = observation.optics
@@ -98,24 +96,23 @@ def equations_of(observation: Observation, particles: Floats) -> Equations:
     return Equations(slopes, neighbours, alone, block, np.asarray(np.linalg.inv(alone), np.float64))
 
 
-def all_slopes(
-    observation: Observation, particles: Floats
-) -> tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.float32]]:
-    """Return what `_slopes_of` does, particles shared out to threads."""
+def all_slopes(observation: Observation, particles: Floats) -> Slopes:
+    """Return what the unknowns of particles (n, 4) do to the pixels."""
     parts = in_threads(lambda part: _slopes_of(observation, particles[part]), blocks(len(particles), BLOCK))
-    counts, pixel, slope = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
-    return counts, pixel, slope
+    counts, row, column, slope = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
+    return Slopes(np.concatenate([[0], np.cumsum(counts)]), row, column, slope)
 
 
 @njit(cache=True, nogil=True)
 def _slopes_of(
     observation: Observation, particles: Floats
-) -> tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.float32]]:
-    """Return the number of entries of each particle, and the pixels and slopes of all."""
-    count, capacity = particles.shape[0], observation.capacity
+) -> tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.int32], NDArray[np.float32]]:
+    """Return the number of entries of each particle, and rows, columns and slopes of all."""
+    count, capacity, columns = particles.shape[0], observation.capacity, observation.optics.camera.columns
     responses = room_for(1, capacity, 0)
     counts = np.zeros(count, np.int64)
-    pixel, slope = np.empty(count * capacity, np.int32), np.empty((count * capacity, UNKNOWNS), np.float32)
+    row, column = np.empty(count * capacity, np.int32), np.empty(count * capacity, np.int32)
+    slope = np.empty((count * capacity, UNKNOWNS), np.float32)
     end = 0
     for n in range(count):
         observation.respond(observation.optics, particles[n : n + 1], responses)
@@ -124,13 +121,13 @@ def _slopes_of(
             # A pixel that is named again has no light.
             if values[0, k] > 0.0:
                 root = np.sqrt(observation.weight[pixels[k]])
-                pixel[end] = pixels[k]
+                row[end], column[end] = divmod(pixels[k], columns)
                 for unknown in range(3):
                     slope[end, unknown] = root * particles[n, 3] * values[1 + unknown, k]
                 slope[end, 3] = root * values[0, k]
                 counts[n] += 1
                 end += 1
-    return counts, pixel[:end].copy(), slope[:end].copy()
+    return counts, row[:end].copy(), column[:end].copy(), slope[:end].copy()
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)

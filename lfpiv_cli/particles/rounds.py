@@ -73,8 +73,8 @@ ROUNDS = (
 
 # A thorough round that finds no more than this share more is the last one; what follows looks for more anyway.
 FEW = 0.01
-# Sweeps of refinement after candidates and after splitting.
-SWEEPS, SWEEPS_AFTER_SPLIT = 4, 1
+# Sweeps of refinement after candidates and after splitting: with twice as many as many tracers are found, or fewer.
+SWEEPS, SWEEPS_AFTER_SPLIT = 2, 1
 # How often particles are checked, and joined afterwards, at most: until that changes their number by hardly any more.
 # With 0.65 for each microlens that is after three checks and one join, with 3 after twelve and ten.
 MOST_CHECKS, MOST_JOINS, HARDLY_ANY = 40, 12, 0.003

@@ -283,10 +283,14 @@ def _write_mask(part: tuple[int, int], columns: Floats, rows: Floats, radius: fl
         y0, y1 = rows[r]
         for c in range(columns.shape[0]):
             x0, x1 = columns[c]
-            inside = (
-                disc_area_below(x1, y1, radius)
-                - disc_area_below(x0, y1, radius)
-                - disc_area_below(x1, y0, radius)
-                + disc_area_below(x0, y0, radius)
-            )
-            mask[r, c] = max(inside, 0.0) / ((x1 - x0) * (y1 - y0)) / DISC_SHARE_OF_SQUARE
+            area = (x1 - x0) * (y1 - y0)
+            if max(x1, -x0) ** 2 + max(y1, -y0) ** 2 <= radius * radius:
+                inside = area
+            else:
+                inside = (
+                    disc_area_below(x1, y1, radius)
+                    - disc_area_below(x0, y1, radius)
+                    - disc_area_below(x1, y0, radius)
+                    + disc_area_below(x0, y0, radius)
+                )
+            mask[r, c] = max(inside, 0.0) / area / DISC_SHARE_OF_SQUARE
