@@ -13,7 +13,7 @@ from lfpiv_cli.optics.camera import Camera, Lattice
 from lfpiv_cli.optics.line_responses import USUAL_DIFFUSION_PX
 from lfpiv_cli.optics.media import Media
 from lfpiv_cli.particles.camera_light import MODEL_SHARE, MODEL_SQUARES, Forms, forms_of, together_of
-from lfpiv_cli.particles.diameter import NO_SIZES, Diameter, Sizes, Trial, _settled_sizes, diameter_by, diameter_of
+from lfpiv_cli.particles.diameter import NO_SIZES, Diameter, Sizes, _settled_sizes, diameter_by, diameter_of
 from lfpiv_cli.particles.search import Task
 from lfpiv_cli.particles.view import Light, raw_view, with_radius
 from lfpiv_cli.verbs.tracers import Diffusion, TracerSize, size_notices
@@ -192,7 +192,8 @@ def test_notices_of_diameter_and_diffusion(given: float | None, size: TracerSize
 @pytest.mark.parametrize(("count", "enough"), [(40, True), (20, True), (19, False), (10, False), (0, False)])
 def test_a_size_is_that_of_half_the_tracers(monkeypatch: pytest.MonkeyPatch, count: int, enough: bool) -> None:
     losses = np.square(np.arange(-2.0, 3.0))[:, np.newaxis] * np.ones(40)
-    trial, found = Trial(0.5, losses, np.arange(40) < count), (SimpleNamespace(view=None), None)
+    trial = SimpleNamespace(diameter=0.5, losses=losses, alone=np.arange(40) < count)
+    found = SimpleNamespace(view=None), None
     for name, answer in (("_found", found), ("_tried", trial), ("by_waves", False)):
         monkeypatch.setattr(f"lfpiv_cli.particles.diameter.{name}", lambda *_, answer=answer: answer)
     # Six for each microlens, of which ten of forty seemed to stand alone, showed 0.72 microlenses in place of 0.5.

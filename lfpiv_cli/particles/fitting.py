@@ -39,12 +39,13 @@ from lfpiv_cli.particles.least_squares import (
 from lfpiv_cli.particles.refraction import on_line_of_sight
 from lfpiv_cli.particles.view import View, entry_capacity, over_tiles, type_by_form
 
-# Candidates begin at their own depth: from others beside it no more are found, and those near the focal plane, where
-# several hold, are tried at others later. Where light spreads by no more than so many lenses, fits reach a particle
-# only from its own part of a lens: there a candidate that does not hold begins again from so far beside it, in lenses.
+# A candidate that does not hold where it is begins again from these depths beside its own, in depths over which light
+# spreads by one lens (Table 2: 0.4 mm). Where light spreads by no more than so many lenses, fits reach a particle only
+# from its own part of a lens: there from so far beside it, too, in lenses.
+START_DEPTHS = np.array([-0.4, 0.4]) / 1.064
 FEW_LENSES = 2.0
 START_BESIDE = 0.33 * np.array([(x, y) for x in (-1.0, 0.0, 1.0) for y in (-1.0, 0.0, 1.0) if x or y])
-# Steps from each of these depths; from where that led in the best of them; for a particle in a sweep.
+# Steps from each of these places; from where that led in the best of them; for a particle in a sweep.
 FIRST_STEPS = 3
 CANDIDATE_STEPS = 12
 SWEEP_STEPS = 4
@@ -375,10 +376,13 @@ def accept(observation: Observation, candidates: Floats, least: Least) -> NDArra
     accepted, fitter = np.zeros(len(candidates), np.bool_), fitter_of(observation)
     choice = Choice(Effort(FIRST_STEPS, CHOICE_GAIN), Effort(CANDIDATE_STEPS, CHOICE_GAIN), 1, least.light, np.inf)
     scale = observation.optics.scale
-    depths = np.clip(candidates[:, 2:3], observation.low_mm, observation.high_mm)
-    beside = np.pad(START_BESIDE * scale.lens_mm, ((0, 0), (0, 2)))
+    # Off a candidate's own place, the own depth first, those beside it last.
+    off = np.zeros((1 + len(START_DEPTHS) + len(START_BESIDE), UNKNOWNS))
+    off[1 : 1 + len(START_DEPTHS), 2] = START_DEPTHS * scale.depth_mm
+    off[1 + len(START_DEPTHS) :, :2] = START_BESIDE * scale.lens_mm
     narrow = np.abs(candidates[:, 2]) < FEW_LENSES * scale.depth_mm
-    arguments = fitter, candidates, choice, depths, beside, narrow, least, accepted
+    begins = np.where(narrow, len(off), 1 + len(START_DEPTHS))
+    arguments = fitter, candidates, choice, off, begins, least, accepted
     over_tiles(_accept, observation.optics, candidates, observation.depths_mm, *arguments)
     return accepted
 
@@ -389,24 +393,25 @@ def _accept(
     fitter: Fitter,
     candidates: Floats,
     choice: Choice,
-    depths: Floats,
-    beside: Floats,
-    narrow: NDArray[np.bool_],
+    off: Floats,
+    begins: NDArray[np.int64],
     least: Least,
     accepted: NDArray[np.bool_],
 ) -> None:
-    """Do the work of `accept` for the candidates of a tile."""
+    """Do the work of `accept` for the candidates of a tile, which begin so far `off` (k, 4), the first so many."""
     observation, _ = fitter.to
     responses, best = room_for(1, observation.capacity, 0), np.empty((1, UNKNOWNS))
-    starts = np.empty((len(beside), 1, UNKNOWNS))
+    starts, place, depth = np.empty((len(off), 1, UNKNOWNS)), np.empty(UNKNOWNS), np.empty(1)
     for number in numbers:
-        begin_at(observation.optics, candidates[number], depths[number], starts[:1])
+        for k in range(begins[number]):
+            for axis in range(UNKNOWNS):
+                place[axis] = candidates[number, axis]
+            place[0], place[1] = place[0] + off[k, 0], place[1] + off[k, 1]
+            depth[0] = min(max(place[2] + off[k, 2], observation.low_mm), observation.high_mm)
+            begin_at(observation.optics, place, depth, starts[k : k + 1])
         holds = _holds(fitter, starts[:1], responses, choice, least, best)
-        if narrow[number] and not holds:
-            for k in range(len(beside)):
-                place = candidates[number] + beside[k]
-                begin_at(observation.optics, place, depths[number], starts[k : k + 1])
-            holds = _holds(fitter, starts, responses, choice, least, best)
+        if not holds:
+            holds = _holds(fitter, starts[1 : begins[number]], responses, choice, least, best)
         if holds:
             copy_rows(best, candidates[number : number + 1])
             accepted[number] = True

@@ -71,7 +71,8 @@ ROUNDS = (
     Round(4, 0.6, 0.05, thorough=True),
 )
 
-# A thorough round that finds no more than this share more is the last one; what follows looks for more anyway.
+# A thorough round that finds no more than this share more is the last one; what follows looks for more anyway. Where
+# there is none yet, it may be found by a round that asks for less.
 FEW = 0.01
 # Sweeps of refinement after candidates and after splitting: with twice as many as many tracers are found, or fewer.
 SWEEPS, SWEEPS_AFTER_SPLIT = 2, 1
@@ -121,7 +122,7 @@ def after_rounds(
         state = explained(task, *with_candidates(task, state, candidates, light), settings)
         if progress:
             progress(1)
-        if settings.thorough and len(state.particles) - before <= FEW * before:
+        if settings.thorough and 0 < len(state.particles) <= (1.0 + FEW) * before:
             if progress:
                 progress(steps_of(rounds[number + 1 :]))
             break
