@@ -134,8 +134,9 @@ def test_what_is_left_without_light_is_no_particle(table2: Camera, water: Media,
 @pytest.mark.thorough
 def test_sweeps_end_where_those_over_all_end(task: Task, tracers: Floats) -> None:
     every, some = begun(task, tracers), begun(task, tracers)
+    observation = observed(task, every, 0.05)
     for _ in range(6):
-        refine(observed(task, every, 0.05), every.particles, SMALLEST_GAIN)
+        refine(observation, every.particles, SMALLEST_GAIN)
     search.sweep(task, some, 0.05, 6, SMALLEST_GAIN)
     # What ends a fit is a tenth of a standard error, and here one is 1e-4 mm laterally, 1e-3 mm in depth, 500 counts.
     np.testing.assert_allclose((some.particles - every.particles) / (1e-4, 1e-4, 1e-3, 500.0), 0.0, atol=0.2)
@@ -503,9 +504,9 @@ def test_tracers_are_counted_few_or_crowded_and_light_that_does_not_tell_is_not(
     image = image_of(bench, 12.0, 0) - np.float32(100.0)
     frame = frame_of(bench, image, image)
     points = points_of(bench, frame, find(bench, frame), TracerSize(0.05), {})
-    # Part of what they light is explained, by particles that are not there.
-    unexplained, crowded = light_notices(points, "crowded")
-    assert (unexplained.code, crowded.code) == ("light-unexplained", "particles-crowded")
+    # Most of what they light is explained, by particles that are not there.
+    model, crowded = light_notices(points, "crowded")
+    assert (model.code, crowded.code) == ("light-model", "particles-crowded")
     # Two standard errors of what one image of so few microlenses tells.
     assert crowded.measured == pytest.approx(12.0, rel=0.4)
     # What noise alone leaves is no light of tracers: where none was found it made 40 for each microlens.
