@@ -8,6 +8,7 @@ from time import sleep
 
 import numpy as np
 import pytest
+from numba import get_num_threads
 
 from lfpiv_cli.arrays import Floats
 from lfpiv_cli.errors import InputError, UsageError
@@ -440,7 +441,8 @@ def test_results_are_in_order_and_errors_come_through() -> None:
         in_threads(lambda k: 10 // k, [0, 1, 5], [set(), {0}, {1}])
     done: list[int] = []
     in_threads(lambda k: (sleep(0.02 * (k == 0)), done.append(k)), range(4), [set(), {0}, set(), {1}])
-    assert (done.index(0) < done.index(1) < done.index(3), done[0]) == (True, 2)
+    # With one thread they follow each other.
+    assert (done.index(0) < done.index(1) < done.index(3), done[0]) == (True, 2 if get_num_threads() > 1 else 0)
     sums = in_threads(lambda row: sum(in_threads(lambda k: row * k, range(5))), range(5))
     assert sums == [10 * row for row in range(5)]
 

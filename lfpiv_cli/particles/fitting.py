@@ -401,22 +401,29 @@ def _accept(
     """Do the work of `accept` for the candidates of a tile, which begin so far `off` (k, 4), the first so many."""
     observation, _ = fitter.to
     responses, best = room_for(1, observation.capacity, 0), np.empty((1, UNKNOWNS))
-    starts, place, depth = np.empty((len(off), 1, UNKNOWNS)), np.empty(UNKNOWNS), np.empty(1)
+    starts = np.empty((len(off), 1, UNKNOWNS))
     for number in numbers:
-        for k in range(begins[number]):
-            for axis in range(UNKNOWNS):
-                place[axis] = candidates[number, axis]
-            place[0], place[1] = place[0] + off[k, 0], place[1] + off[k, 1]
-            depth[0] = min(max(place[2] + off[k, 2], observation.low_mm), observation.high_mm)
-            begin_at(observation.optics, place, depth, starts[k : k + 1])
+        _begin_off(observation, candidates[number], off[:1], starts[:1])
         holds = _holds(fitter, starts[:1], responses, choice, least, best)
         if not holds:
-            holds = _holds(fitter, starts[1 : begins[number]], responses, choice, least, best)
+            others = starts[1 : begins[number]]
+            _begin_off(observation, candidates[number], off[1:], others)
+            holds = _holds(fitter, others, responses, choice, least, best)
         if holds:
             copy_rows(best, candidates[number : number + 1])
             accepted[number] = True
             pixels, values = lit_by(responses, 0)
             add_light(pixels, values, -best[0, 3], observation.residual)
+
+
+@njit(cache=True)
+def _begin_off(observation: Observation, candidate: Floats, off: Floats, starts: Floats) -> None:
+    """Fill in starts (n, 1, 4) so far off a candidate: sideways at its depth, and on the line of sight from there."""
+    place, depth = candidate.copy(), np.empty(1)
+    for k in range(len(starts)):
+        place[0], place[1] = candidate[0] + off[k, 0], candidate[1] + off[k, 1]
+        depth[0] = min(max(candidate[2] + off[k, 2], observation.low_mm), observation.high_mm)
+        begin_at(observation.optics, place, depth, starts[k : k + 1])
 
 
 @njit(cache=True, nogil=True)
