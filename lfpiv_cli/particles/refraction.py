@@ -23,14 +23,12 @@ import numpy as np
 from lfpiv_cli.arrays import Floats
 from lfpiv_cli.kernels import COUNT_NO_REFERENCES, njit
 from lfpiv_cli.optics.curved_space import aim, trace_in
-from lfpiv_cli.optics.tracing import SLOPE_NODES, set_slope_polynomial, slope_ratio
+from lfpiv_cli.optics.tracing import SHALLOWEST_DEPTHS, SLOPE_NODES, set_slope_polynomial, slope_ratio
 from lfpiv_cli.particles.pencil import Pencil, cubic_at, largest_of, room_for_pencil, set_pencil
 from lfpiv_cli.particles.view import View
 
 # The shift changes by some 1e-3 of what a point moves: twice leaves a millionth of it.
 REPEATS = 2
-# Points in the window are shifted like those this far behind its face, in depths over which light spreads by one lens.
-SHALLOWEST_DEPTHS = 1e-6
 
 
 class Bend(NamedTuple):
