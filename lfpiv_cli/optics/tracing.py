@@ -34,7 +34,7 @@ from lfpiv_cli.optics.media import (
 # Direct light-field calibration (DLFC, Hall et al. 2018) knows no main lens and no window: it has seen dots at known
 # places through known points of the aperture, and a polynomial of both tells where any other ray goes.
 
-# What is sought in a window lights like what is this far behind its face, in depths over which light spreads by one lens.
+# What is sought in a window lights like what is so far behind its face, in depths over which light spreads by one lens.
 SHALLOWEST_DEPTHS = 1e-6
 
 # x, y, z of where a ray starts, X, Y of where it crosses the main lens.
