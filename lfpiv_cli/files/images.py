@@ -210,7 +210,7 @@ def read_reference(path: Path, shape: Shape | None = None) -> Image:
 
 
 def write_tiff(path: Path, array: NDArray[Any], overwrite: bool) -> None:
-    """Write an image (rows, columns) of type uint8 or uint16, packed without loss and without time stamps."""
+    """Write an image (rows, columns) of type uint8, uint16 or float32, packed without loss and without time stamps."""
     if array.dtype not in (np.uint8, np.uint16, np.float32) or array.ndim != 2:
         raise TypeError(f"images are uint8, uint16 or float32 (rows, columns), not {array.dtype} {array.shape}")
     # What is no count hardly packs: its lowest level takes half the time and 4 % more room.

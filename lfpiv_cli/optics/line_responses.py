@@ -37,7 +37,7 @@ from scipy.special import j0
 from lfpiv_cli.arrays import Floats, Singles
 from lfpiv_cli.kernels import COUNT_NO_REFERENCES, njit
 from lfpiv_cli.optics.camera import Camera
-from lfpiv_cli.optics.tracing import SHALLOWEST_DEPTHS, ObjectSpace, slope_ratios
+from lfpiv_cli.optics.tracing import ObjectSpace, shallowest_mm, slope_ratios
 
 # Spots' places per pitch at which responses are known, and samples of the array between two of them: lenses' edges lie
 # between samples. With half as many places tracers within half a depth unit of focus are off by three times as much.
@@ -248,10 +248,8 @@ class _Pupil:
 
 def _on_array(camera: Camera, space: ObjectSpace, depths_mm: Floats, pupil_mm: Floats) -> Floats:
     """Return where rays of points on the axis through places of the pupil meet the array (depths, places)."""
-    if not space.straight:
-        shallowest = SHALLOWEST_DEPTHS * camera.scale(space.media).depth_mm
-        depths_mm = depths_mm + np.maximum(shallowest - space.last_layers_mm(camera, depths_mm), 0.0)
-    nodes, factors = space.slope_polynomials(camera, depths_mm, camera.aperture_radius_mm)
+    seen = np.maximum(depths_mm, shallowest_mm(space.layers(camera), camera.scale(space.media).depth_mm))
+    nodes, factors = space.slope_polynomials(camera, seen, camera.aperture_radius_mm)
     s_i, ratio = camera.image_distance_mm, slope_ratios(pupil_mm**2, nodes, factors)
     return np.asarray(pupil_mm * (1.0 - s_i / camera.focal_length_mm + s_i * ratio))
 

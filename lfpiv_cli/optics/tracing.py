@@ -34,9 +34,6 @@ from lfpiv_cli.optics.media import (
 # Direct light-field calibration (DLFC, Hall et al. 2018) knows no main lens and no window: it has seen dots at known
 # places through known points of the aperture, and a polynomial of both tells where any other ray goes.
 
-# What is sought in a window lights like what is so far behind its face, in depths over which light spreads by one lens.
-SHALLOWEST_DEPTHS = 1e-6
-
 # x, y, z of where a ray starts, X, Y of where it crosses the main lens.
 VARIABLES = 5
 # Of degree 3 a polynomial has 56 terms, and lenses need no more.
@@ -194,6 +191,8 @@ def disc_points(count: int, radius: float, rng: np.random.Generator) -> Floats:
 # The slope of a refracted ray over its lateral distance is an analytic function of that distance squared, nearly
 # constant: through five points of it, a polynomial is right to 1e-10 for lenses up to f/1.4.
 SLOPE_NODES = 5
+# Just behind the window is so far behind its face, in depths over which light spreads by one lens.
+SHALLOWEST_DEPTHS = 1e-6
 
 
 @dataclass(frozen=True)
@@ -303,6 +302,17 @@ class ObjectSpace:
 
 
 @njit(cache=True)
+@njit(cache=True, **COUNT_NO_REFERENCES)
+def shallowest_mm(layers: Layers, depth_mm: float) -> float:
+    """Return the depth just behind the window: what is sought in front of it lights like what is there.
+
+    Parameters
+    ----------
+    depth_mm : over which light spreads by one lens
+    """
+    return SHALLOWEST_DEPTHS * depth_mm - float(layers.thicknesses_mm[-1])
+
+
 def _polynomials_at(last_layers_mm: Floats, reach_mm: float, layers: Layers) -> tuple[Floats, Floats]:
     """Return nodes and factors for points behind as much of the last layer as given."""
     nodes, factors = np.empty((last_layers_mm.size, SLOPE_NODES)), np.empty((last_layers_mm.size, SLOPE_NODES))

@@ -39,12 +39,12 @@ from lfpiv_cli.particles.least_squares import (
 from lfpiv_cli.particles.refraction import on_line_of_sight
 from lfpiv_cli.particles.view import View, entry_capacity, over_tiles, type_by_form
 
-# A candidate that does not hold where it is begins again from these depths beside its own, in depths over which light
-# spreads by one lens (Table 2: 0.4 mm). Where light spreads by no more than so many lenses, fits reach a particle only
-# from its own part of a lens: there from so far beside it, too, in lenses.
-START_DEPTHS = np.array([-0.4, 0.4]) / 1.064
+# Where a candidate begins, off its place (x, y, z), in microlenses and in depths over which light spreads by one lens
+# (Table 2: 0.4 mm). One that does not hold where it is begins again at the depths; where light spreads by no more than
+# so many lenses fits reach a particle only from its own part of a lens: there beside it, too.
+STARTS_BY_DEPTH = np.array([(0.0, 0.0, 0.0), (0.0, 0.0, -0.4 / 1.064), (0.0, 0.0, 0.4 / 1.064)])
+STARTS_BESIDE = 0.33 * np.array([(x, y, 0.0) for x in (-1.0, 0.0, 1.0) for y in (-1.0, 0.0, 1.0) if x or y])
 FEW_LENSES = 2.0
-START_BESIDE = 0.33 * np.array([(x, y) for x in (-1.0, 0.0, 1.0) for y in (-1.0, 0.0, 1.0) if x or y])
 # Steps from each of these places; from where that led in the best of them; for a particle in a sweep.
 FIRST_STEPS = 3
 CANDIDATE_STEPS = 12
@@ -376,12 +376,9 @@ def accept(observation: Observation, candidates: Floats, least: Least) -> NDArra
     accepted, fitter = np.zeros(len(candidates), np.bool_), fitter_of(observation)
     choice = Choice(Effort(FIRST_STEPS, CHOICE_GAIN), Effort(CANDIDATE_STEPS, CHOICE_GAIN), 1, least.light, np.inf)
     scale = observation.optics.scale
-    # Off a candidate's own place, the own depth first, those beside it last.
-    off = np.zeros((1 + len(START_DEPTHS) + len(START_BESIDE), UNKNOWNS))
-    off[1 : 1 + len(START_DEPTHS), 2] = START_DEPTHS * scale.depth_mm
-    off[1 + len(START_DEPTHS) :, :2] = START_BESIDE * scale.lens_mm
+    off = np.concatenate([STARTS_BY_DEPTH, STARTS_BESIDE]) * scale.box_mm(1.0, 1.0)
     narrow = np.abs(candidates[:, 2]) < FEW_LENSES * scale.depth_mm
-    begins = np.where(narrow, len(off), 1 + len(START_DEPTHS))
+    begins = np.where(narrow, len(off), len(STARTS_BY_DEPTH))
     arguments = fitter, candidates, choice, off, begins, least, accepted
     over_tiles(_accept, observation.optics, candidates, observation.depths_mm, *arguments)
     return accepted
@@ -398,7 +395,7 @@ def _accept(
     least: Least,
     accepted: NDArray[np.bool_],
 ) -> None:
-    """Do the work of `accept` for the candidates of a tile, which begin so far `off` (k, 4), the first so many."""
+    """Do the work of `accept` for the candidates of a tile, each from the first `begins` of places `off` (k, 3)."""
     observation, _ = fitter.to
     responses, best = room_for(1, observation.capacity, 0), np.empty((1, UNKNOWNS))
     starts = np.empty((len(off), 1, UNKNOWNS))

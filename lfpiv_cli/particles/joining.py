@@ -61,8 +61,6 @@ SUM_DEPTHS = 0.1 / 1.064
 PEAK_LENSES, PEAK_DEPTHS = 1.0, 0.1 / 1.064
 # A particle's light lies about so far around its peak.
 LIGHT_LENSES, LIGHT_DEPTHS = 1.0, 0.2 / 1.064
-
-
 # A step that goes half as far again shows in two iterations what takes three: in crowds as many tracers are found so.
 RELAXATION = 1.5
 

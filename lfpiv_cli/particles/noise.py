@@ -200,8 +200,8 @@ def beside_neighbours(residual: Floats, pixels: NDArray[np.intp], columns: int) 
     residual : (rows * columns,)
     """
     left, right = (residual.take(pixels + step, mode="clip") for step in (-1, 1))
-    inner = (pixels % columns > 0) & (pixels % columns < columns - 1)
-    return np.where(inner, (2.0 * residual[pixels] - left - right) / np.sqrt(6.0), 0.0)
+    column = pixels % columns
+    return np.where((column > 0) & (column < columns - 1), (2.0 * residual[pixels] - left - right) / np.sqrt(6.0), 0.0)
 
 
 def mean_whole(counts: Floats, sigma: Floats) -> Floats:

@@ -23,7 +23,7 @@ import numpy as np
 from lfpiv_cli.arrays import Floats
 from lfpiv_cli.kernels import COUNT_NO_REFERENCES, njit
 from lfpiv_cli.optics.curved_space import aim, trace_in
-from lfpiv_cli.optics.tracing import SHALLOWEST_DEPTHS, SLOPE_NODES, set_slope_polynomial, slope_ratio
+from lfpiv_cli.optics.tracing import SLOPE_NODES, set_slope_polynomial, shallowest_mm, slope_ratio
 from lfpiv_cli.particles.pencil import Pencil, cubic_at, largest_of, room_for_pencil, set_pencil
 from lfpiv_cli.particles.view import View
 
@@ -67,7 +67,7 @@ class Rays(NamedTuple):
 @njit(cache=True, **COUNT_NO_REFERENCES)
 def _in_fluid(view: View, z: float) -> float:
     """Return a depth, or that just behind the window where it lies in front of the fluid."""
-    return max(z, SHALLOWEST_DEPTHS * view.scale.depth_mm - view.layers.thicknesses_mm[-1])
+    return max(z, shallowest_mm(view.layers, view.scale.depth_mm))
 
 
 @njit(cache=True)
