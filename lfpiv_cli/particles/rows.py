@@ -79,8 +79,10 @@ ENTRY, LOW = 4, 5
 # 3e-3 of the light is elsewhere then, which moves places by 30 nm. What bent rays move profiles by is alike in all
 # lenses of a column or a row, but for a third of it.
 SHARED, BENT_UNLIKE = 0.05, 1.0 / 3.0
-# Numbers that are no part of a type: for plain ones `_line_up` is compiled once each.
-AXES = np.int64(0), np.int64(1)
+# Numbers that are no part of a type: for plain ones functions are compiled once each.
+AXES = np.int64(0), np.int64(1), np.int64(2)
+# Lenses on their own, see `_shared`.
+ON_THEIR_OWN = np.int64(1), 0.0
 
 
 class Entries(NamedTuple):
@@ -133,7 +135,7 @@ def respond_rows(view: View, bend: Bend, pixels: NDArray[np.int32], values: Sing
     low_i, high_i, low_j, high_j = lenses
     side, more_mm = _shared(view, projection, bend, (high_i + low_i) // 2, (high_j + low_j) // 2)
     count = _write_blocks(view, projection, bend, lenses, (side, more_mm), entries)
-    return count if count >= 0 else _write_blocks(view, projection, bend, lenses, (1, 0.0), entries)
+    return count if count >= 0 else _write_blocks(view, projection, bend, lenses, ON_THEIR_OWN, entries)
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
@@ -271,7 +273,7 @@ def _curved(view: View, projection: Projection, bend: Bend, bent: Bent) -> Curve
         single(ratio_y * y.slope),
         single(-ratio_y * y.slope),
         single(_norm(view, projection)),
-        (_moves(view, bend, 0), _moves(view, bend, 1), _moves(view, bend, 2)),
+        (_moves(view, bend, AXES[0]), _moves(view, bend, AXES[1]), _moves(view, bend, AXES[2])),
         single(far * x.stretch / by_x),
         single(far * y.stretch / by_y),
         single(bent.x / by_x),
