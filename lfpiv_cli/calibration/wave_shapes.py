@@ -19,7 +19,7 @@ from lfpiv_cli.arrays import Floats, Integers
 from lfpiv_cli.calibration.shape_fit import PixelRays, SharesAndSlopes, Strips
 from lfpiv_cli.kernels import njit
 from lfpiv_cli.optics.camera import Camera
-from lfpiv_cli.optics.line_responses import PHASES, LineResponses, line_responses, on_pixels, spline_weights
+from lfpiv_cli.optics.line_responses import PHASES, LineResponses, line_responses, of_tracers, spline_weights
 from lfpiv_cli.optics.media import Media, equivalent_object_distance
 from lfpiv_cli.optics.tracing import ObjectSpace
 
@@ -94,7 +94,7 @@ class WaveShapes:
         space, beyond = ObjectSpace(medium, refraction="paraxial"), BY_RAYS * camera.scale(medium).depth_mm
         ends = float(depths_mm.min()) - beyond, float(depths_mm.max()) + beyond
         lines = line_responses(camera, space, light.wavelength_mm, ends)
-        return cls(camera, medium, on_pixels(lines, light.diffusion_px))
+        return cls(camera, medium, of_tracers(lines, 0.0, light.diffusion_px))
 
     @property
     def lens_mm(self) -> float:

@@ -38,6 +38,7 @@ from lfpiv_cli.arrays import Floats, Singles
 from lfpiv_cli.kernels import COUNT_NO_REFERENCES, njit
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.tracing import ObjectSpace, shallowest_mm, slope_ratios
+from lfpiv_cli.threads import in_threads
 
 # Spots' places per pitch at which responses are known, and samples of the array between two of them: lenses' edges lie
 # between samples. With half as many places tracers within half a depth unit of focus are off by three times as much.
@@ -114,7 +115,9 @@ def line_responses(
     positive = np.arange(TERMS) < (TERMS + 1) // 2
     depths, offsets, responses, terms = whole.shape
     by_phase = whole.reshape(depths, offsets, responses // PHASES, PHASES, terms).transpose(0, 1, 3, 4, 2)
-    table = _mixed(np.ascontiguousarray(by_phase, dtype=np.float32), _spline_of_places(pupil.pixels))
+    spline, table = _spline_of_places(pupil.pixels), np.empty(by_phase.shape, np.float32)
+    for plane, places in zip(table, by_phase, strict=True):
+        plane[:] = _mixed(places, spline)
     for axis in (0, 1):
         spline_filter1d(table, axis=axis, output=table)
     return LineResponses(
@@ -128,42 +131,39 @@ def line_responses(
     )
 
 
-def of_balls(points: LineResponses, radius_mm: float) -> LineResponses:
-    """Return the responses of balls of this radius on the array, their light a product of both axes' distributions."""
+def of_tracers(points: LineResponses, radius_mm: float, diffusion_px: float) -> LineResponses:
+    """Return the responses of balls on pixels that integrate where samples were summed.
+
+    Parameters
+    ----------
+    radius_mm : on the array; the light of a ball is a product of both axes' distributions
+    diffusion_px : standard deviation of the Gaussian by which charge diffuses
+    """
     count = int(np.ceil(radius_mm / points.offset_step_mm))
     edges = np.clip((np.arange(-count, count + 2) - 0.5) * points.offset_step_mm / max(radius_mm, 1e-9), -1.0, 1.0)
     share = np.diff(0.25 * (2.0 + 3.0 * edges - edges**3)).astype(np.float32)
-    found = np.empty_like(points.table)
-    _average(points.table, share, found)
-    return points._replace(table=found)
-
-
-@njit(cache=True, nogil=True)
-def _average(table: Lines, share: Lines, found: Lines) -> None:
-    """Fill in the means over neighbouring offsets, of these shares."""
-    depths, offsets = table.shape[:2]
-    half = share.size // 2
-    for depth in range(depths):
-        for offset in range(offsets):
-            target = found[depth, offset]
-            target[:] = np.float32(0.0)
-            for n in range(max(0, half - offset), min(share.size, offsets + half - offset)):
-                source, weight = table[depth, offset + n - half], share[n]
-                for phase in range(target.shape[0]):
-                    for term in range(target.shape[1]):
-                        for pixel in range(target.shape[2]):
-                            target[phase, term, pixel] += weight * source[phase, term, pixel]
-
-
-def on_pixels(points: LineResponses, diffusion_px: float) -> LineResponses:
-    """Return responses after charge has diffused by a Gaussian, of pixels that integrate where samples were summed."""
     pixels = points.table.shape[-1]
     places = PHASES * pixels
     frequency = np.fft.rfftfreq(2 * places, 1.0 / PHASES)
     damping = np.sinc(frequency / FINE) * np.exp(-2.0 * (np.pi * diffusion_px * frequency) ** 2)
     blur = np.fft.irfft(np.fft.rfft(np.eye(places), 2 * places) * damping)[:, :places]
     spline = _spline_of_places(pixels)
-    return points._replace(table=_mixed(points.table, np.asarray(np.linalg.solve(spline, blur @ spline))))
+    mix = np.asarray(np.linalg.solve(spline, blur @ spline))
+    found = np.empty_like(points.table)
+    in_threads(lambda depth: _average(_mixed(points.table[depth], mix), share, found[depth]), range(len(found)))
+    return points._replace(table=found)
+
+
+@njit(cache=True, nogil=True)
+def _average(plane: Lines, share: Lines, found: Lines) -> None:
+    """Fill in the means over neighbouring offsets, of these shares, of (offsets, PHASES, terms, pixels)."""
+    offsets, half = plane.shape[0], share.size // 2
+    source, target = plane.reshape(offsets, -1), found.reshape(offsets, -1)
+    for offset in range(offsets):
+        target[offset] = np.float32(0.0)
+        for n in range(max(0, half - offset), min(share.size, offsets + half - offset)):
+            for place in range(target.shape[1]):
+                target[offset, place] += share[n] * source[offset + n - half, place]
 
 
 def _spline_of_places(pixels: int) -> Floats:
@@ -185,13 +185,14 @@ def spline_slopes(t: float) -> tuple[float, float, float, float]:
     return -0.5 * u * u, t * (1.5 * t - 2.0), u * (2.0 - 1.5 * u), 0.5 * t * t
 
 
-def _mixed(table: Lines, shares: Floats) -> Lines:
-    """Return the table with each place under the lens replaced by a sum of all, `shares` (from, to)."""
-    found = np.zeros_like(table)
-    for before in range(PHASES):
-        for behind in range(PHASES):
-            found[:, :, behind] += table[:, :, before] @ shares[before::PHASES, behind::PHASES].astype(np.float32)
-    return found
+def _mixed(plane: Lines, shares: Floats) -> Lines:
+    """Return (offsets, PHASES, terms, pixels) with each place under the lens a sum of all, `shares` (from, to)."""
+    offsets, phases, terms, pixels = plane.shape
+    # Places by phases: of one phase those of all pixels.
+    order = np.arange(phases * pixels).reshape(pixels, phases).T.ravel()
+    # Small products, each on one thread.
+    mixed = plane.swapaxes(1, 2).reshape(offsets, terms, -1) @ shares[np.ix_(order, order)].astype(np.float32)
+    return np.ascontiguousarray(mixed.reshape(offsets, terms, phases, pixels).swapaxes(1, 2))
 
 
 class _Pupil:

@@ -26,7 +26,7 @@ from lfpiv_cli.grid import Scale
 from lfpiv_cli.kernels import for_types_of
 from lfpiv_cli.optics.camera import Camera, KernelCamera, Lattice, nearest_on_grid
 from lfpiv_cli.optics.curved_space import CurvedSpace
-from lfpiv_cli.optics.line_responses import NO_LINES, LineResponses, line_responses, of_balls, on_pixels
+from lfpiv_cli.optics.line_responses import NO_LINES, LineResponses, line_responses, of_tracers
 from lfpiv_cli.optics.media import Layers, Media
 from lfpiv_cli.optics.surfaces import Faces
 from lfpiv_cli.optics.tracing import ObjectSpace, refraction_error_mm
@@ -278,7 +278,7 @@ def with_diffusion(view: View, diffusion_px: float) -> View:
     """Return the view by waves with charge that diffuses by another Gaussian."""
     camera = view.camera
     radius = view.particle_radius_mm * camera.image_distance_mm / camera.focus_distance_mm
-    lines = of_balls(on_pixels(view.points, diffusion_px), radius)
+    lines = of_tracers(view.points, radius, diffusion_px)
     return view._replace(lines=lines, diffusion_px=float(diffusion_px))
 
 
