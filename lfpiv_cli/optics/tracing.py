@@ -301,7 +301,6 @@ class ObjectSpace:
         return ratio * lateral, np.ones(len(lateral), dtype=np.bool_)
 
 
-@njit(cache=True)
 @njit(cache=True, **COUNT_NO_REFERENCES)
 def shallowest_mm(layers: Layers, depth_mm: float) -> float:
     """Return the depth just behind the window: what is sought in front of it lights like what is there.
@@ -313,6 +312,7 @@ def shallowest_mm(layers: Layers, depth_mm: float) -> float:
     return SHALLOWEST_DEPTHS * depth_mm - float(layers.thicknesses_mm[-1])
 
 
+@njit(cache=True)
 def _polynomials_at(last_layers_mm: Floats, reach_mm: float, layers: Layers) -> tuple[Floats, Floats]:
     """Return nodes and factors for points behind as much of the last layer as given."""
     nodes, factors = np.empty((last_layers_mm.size, SLOPE_NODES)), np.empty((last_layers_mm.size, SLOPE_NODES))
