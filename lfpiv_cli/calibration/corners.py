@@ -30,6 +30,7 @@ from lfpiv_cli.notice import written
 from lfpiv_cli.optics.camera import Camera, undistorted
 from lfpiv_cli.optics.media import Media
 from lfpiv_cli.robust import MAD_TO_SIGMA
+from lfpiv_cli.threads import in_threads
 
 # What a corner of a chessboard looks like on the sensor, and the corner that explains given pixels best.
 #
@@ -185,7 +186,7 @@ class Look(ABC):
                 near = np.abs(places[:, 2] - np.median(places[:, 2])) < camera.scale(self.medium).depth_mm
                 places, numbers = places[near], None if numbers is None else numbers[near]
                 waves = WaveShapes.of(camera, self.medium, light, places[:, 2])
-            fits = [self.fitted(place, camera, board, shape, waves) for place in places]
+            fits = in_threads(partial(self.fitted, camera=camera, board=board, shape=shape, waves=waves), places)
             numbers = None if numbers is None else numbers[[fit is not None for fit in fits]]
             places = np.array([fit.position_mm for fit in fits if fit is not None]).reshape(-1, 3)
         sigmas = np.sqrt(np.array([np.diag(fit.covariance_mm2) for fit in fits if fit is not None])).reshape(-1, 3)

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lfpiv_cli.arrays import Floats, Integers
+from lfpiv_cli.arrays import Floats, Singles
 from lfpiv_cli.calibration.shape_fit import PixelRays, SharesAndSlopes, Strips
 from lfpiv_cli.kernels import njit
 from lfpiv_cli.optics.camera import Camera
@@ -113,41 +113,21 @@ class WaveShapes:
         """Return for each pixel the light (n,) of a shape over that of light that fills the scene."""
         camera, lines, z = self.camera, self.lines, float(position_mm[2])
         back = camera.image_distance_mm / float(equivalent_object_distance(z, camera.focus_distance_mm, self.medium))
-        (of_column, x, u), (of_row, y, v) = (self._lines_of(rays, -back * position_mm[:2], axis) for axis in (0, 1))
         first, weights = _about((z - lines.first_depth_mm) / lines.depth_step_mm, len(lines.table))
         plane = np.tensordot(np.array(weights), lines.table[first : first + 4], 1)
-        # From phases to places: (offsets, terms, responses).
+        # From phases to places; sums end halfway between the offsets of the responses.
         offsets, _, terms, _ = plane.shape
-        by_place = np.ascontiguousarray(plane.transpose(0, 2, 3, 1).reshape(offsets, terms, -1), dtype=np.float64)
-        sums = np.cumsum(by_place, axis=0)
-        begin, end = (self._read(sums, x - back * at, u) for at in (strips.begin_mm, strips.end_mm))
+        by_place = plane.transpose(0, 3, 1, 2).reshape(offsets, -1, terms)
+        sums = np.cumsum(by_place, axis=0, dtype=np.float64)
+        spot = (-back * position_mm[:2] - rays.ideal_mm) / lines.offset_step_mm + 0.5 * offsets - 1.0
+        under = (rays.place_mm - camera.micro_image_scale * rays.lens_mm) / camera.pixel_mm
         half = 0.5 * strips.width_mm
-        low, high = (self._read(sums, y - back * at, v) for at in (strips.aside_mm - half, strips.aside_mm + half))
-        light = ((begin - end) * lines.signs).reshape(len(x), -1) @ (low - high).reshape(len(y), -1).T
-        along, across = (self._read(sums[-1:], np.zeros_like(at), px)[:, 0] for at, px in ((x, u), (y, v)))
-        filled = (along * lines.signs) @ across.T
-        return np.asarray((light / filled)[of_column, of_row])
-
-    def _lines_of(self, rays: PixelRays, spot_mm: Floats, axis: int) -> tuple[Integers, Floats, Floats]:
-        """Return the column or row of each pixel (n,), and of each of these where spot (m, 1) and pixels (m,) lie.
-
-        The spot from the lens, mm, and the pixels from the middle of the lens image. Distortion moves the lenses of one
-        column apart by less than a thousandth of their width.
-        """
-        _, first, number = np.unique(rays.place_mm[:, axis], return_index=True, return_inverse=True)
-        beside = spot_mm[axis] - np.bincount(number, rays.ideal_mm[:, axis]) / np.bincount(number)
-        under = rays.place_mm[first, axis] - self.camera.micro_image_scale * rays.lens_mm[first, axis]
-        return number, beside[:, np.newaxis], under / self.camera.pixel_mm
-
-    def _read(self, sums: Floats, beside_mm: Floats, under_px: Floats) -> Floats:
-        """Return sums (offsets, terms, responses) up to where spots (n, m) light pixels (n,): (n, m, terms).
-
-        They end halfway between the offsets of the responses.
-        """
-        offset = beside_mm / self.lines.offset_step_mm + 0.5 * len(sums) - 1.0
-        found = np.empty((*beside_mm.shape, sums.shape[1]))
-        _interpolate(sums, offset, PHASES * under_px + 0.5 * sums.shape[2], found)
-        return found
+        sides = np.stack([strips.begin_mm, strips.end_mm, strips.aside_mm - half, strips.aside_mm + half])
+        shares = np.empty(len(spot))
+        _add_strips(
+            sums, spot, PHASES * under + 0.5 * sums.shape[1], back / lines.offset_step_mm * sides, lines.signs, shares
+        )
+        return shares
 
 
 @njit(cache=True)
@@ -157,21 +137,37 @@ def _about(place: float, count: int) -> tuple[int, tuple[float, float, float, fl
     return int(inside) - 1, spline_weights(inside - int(inside))
 
 
-@njit(cache=True)
-def _interpolate(table: Floats, offset: Floats, response: Floats, found: Floats) -> None:
-    """Write a table (offsets, terms, responses) at places (n, m) and (n,): (n, m, terms).
+@njit(cache=True, nogil=True)
+def _add_strips(sums: Floats, spot: Floats, under: Floats, sides: Floats, signs: Singles, shares: Floats) -> None:
+    """Write the light (n,) of strips over that of light that fills the scene.
 
-    A table of one offset is that of all.
+    Parameters
+    ----------
+    sums : (offsets, responses, terms) of the line responses up to an offset
+    spot, under : (n, 2) the spot of the shape's place among offsets, and pixels among responses
+    sides : (4, strips) where along x they begin and end, along y the same, from the shape's place, in offsets
     """
-    few = min(len(table), 4)
-    for n in range(offset.shape[0]):
-        first_response, of_response = _about(response[n], table.shape[2])
-        for m in range(offset.shape[1]):
-            first, of_offset = _about(offset[n, m], len(table)) if few == 4 else (0, (1.0, 0.0, 0.0, 0.0))
-            for term in range(table.shape[1]):
-                total = 0.0
-                for a in range(few):
-                    line = table[first + a, term]
-                    for b in range(4):
-                        total += of_offset[a] * of_response[b] * line[first_response + b]
-                found[n, m, term] = total
+    offsets, responses, terms = sums.shape
+    lines, ends, light = np.empty((2, offsets, terms)), np.empty((4, terms)), np.empty(terms)
+    for n in range(len(spot)):
+        for axis in range(2):
+            first, (a, b, c, d) = _about(under[n, axis], responses)
+            to_sides = sides[2 * axis : 2 * axis + 2]
+            begin, _ = _about(spot[n, axis] - to_sides.max(), offsets)
+            end, _ = _about(spot[n, axis] - to_sides.min(), offsets)
+            for place in range(begin, end + 5):
+                # the last one is that of all light
+                offset = place if place < end + 4 else offsets - 1
+                four, line = sums[offset, first : first + 4], lines[axis, offset]
+                for term in range(terms):
+                    line[term] = a * four[0, term] + b * four[1, term] + c * four[2, term] + d * four[3, term]
+        light[:] = 0.0
+        for strip in range(sides.shape[1]):
+            for side in range(4):
+                first, (a, b, c, d) = _about(spot[n, side // 2] - sides[side, strip], offsets)
+                four = lines[side // 2, first : first + 4]
+                for term in range(terms):
+                    ends[side, term] = a * four[0, term] + b * four[1, term] + c * four[2, term] + d * four[3, term]
+            for term in range(terms):
+                light[term] += (ends[0, term] - ends[1, term]) * (ends[2, term] - ends[3, term])
+        shares[n] = np.sum(signs * light) / np.sum(signs * lines[0, offsets - 1] * lines[1, offsets - 1])
