@@ -19,7 +19,15 @@ from lfpiv_cli.optics.media import Media, Window
 from lfpiv_cli.optics.tracing import ObjectSpace, disc_points
 from lfpiv_cli.optics.waves import DEGREE, Waves, WavesInCamera, pixel_response
 from lfpiv_cli.synthetic.board import BoardPlacement, render_board, sunflower
-from lfpiv_cli.synthetic.render import Balls, lens_blur_mm, lens_spread, points_in_ball, render_points, render_white
+from lfpiv_cli.synthetic.render import (
+    Balls,
+    enough_points,
+    lens_blur_mm,
+    lens_spread,
+    points_in_ball,
+    render_points,
+    render_white,
+)
 from tests.commands import WATER
 from tests.known_rays import tube_of
 
@@ -260,10 +268,15 @@ def test_points_of_a_ball_spread_as_its_glow(count: int) -> None:
 
 
 @pytest.mark.thorough
-def test_sixteen_points_are_a_ball_of_fifty_micrometres(square: Camera) -> None:
+def test_a_ball_has_as_many_points_as_are_not_resolved(square: Camera) -> None:
+    """By the L1 norm 0.5 % of their light is elsewhere, of as few as of a ball of half the width more than twice that."""
+    assert enough_points(square, GREEN, 0.05) == 62
+    assert enough_points(square, GREEN, 0.1) == pytest.approx(4 * 62, abs=3)
+    assert enough_points(square, GREEN, 0.001) == enough_points(square, GREEN, 0.02) == 16
     for z in (0.3, 1.0, 4.0):
-        few, many = (by_waves(square, (0.21, -0.13, z), Waves(532e-6, points), diameter=0.05) for points in (16, 150))
-        assert apart(few, many) < 0.02
+        light = [replace(GREEN, points=points) for points in (None, 16, 250)]
+        by_default, few, many = (by_waves(square, (0.21, -0.13, z), each, diameter=0.05) for each in light)
+        assert apart(by_default, many) < min(0.005, 0.5 * apart(few, many))
 
 
 def test_same_bits_for_any_number_of_threads(small: Camera, rng: np.random.Generator, one_thread) -> None:

@@ -65,11 +65,11 @@ class Waves:
     Attributes
     ----------
     wavelength_mm : in air
-    points : of a tracer, which glow independently of each other; of a tracer without a size one is taken
+    points : of a tracer, which glow independently of each other, one where it has no size; None: as many as are needed
     """
 
     wavelength_mm: float
-    points: int = 16
+    points: int | None = None
 
 
 @dataclass(frozen=True, eq=False)
