@@ -269,7 +269,7 @@ def test_points_of_a_ball_spread_as_its_glow(count: int) -> None:
 
 @pytest.mark.thorough
 def test_a_ball_has_as_many_points_as_are_not_resolved(square: Camera) -> None:
-    """By the L1 norm 0.5 % of their light is elsewhere, of as few as of a ball of half the width more than twice that."""
+    """By the L1 norm 0.5 % of their light is elsewhere, of as few as half the width has twice that."""
     assert enough_points(square, GREEN, 0.05) == 62
     assert enough_points(square, GREEN, 0.1) == pytest.approx(4 * 62, abs=3)
     assert enough_points(square, GREEN, 0.001) == enough_points(square, GREEN, 0.02) == 16
