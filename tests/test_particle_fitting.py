@@ -261,7 +261,7 @@ def test_overlapping_particles_are_separated_and_a_single_one_is_not_split(view:
     image = image_of(view, pair)
     one = np.array([[0.225, 0.09, 2.1, 9e5]])
     residual = image - image_of(view, one)
-    partners = split(observed(view, residual, 1.0 / (image + 36.0)), one, np.array([True]), 1e5, 100.0)
+    partners = split(observed(view, residual, 1.0 / (image + 36.0)), one, np.array([True]), 1e5, np.array([100.0]))
     found = np.concatenate([one, partners])
     found = found[np.argsort(found[:, 0])]
     np.testing.assert_allclose(found[:, :2], pair[:, :2], atol=1e-3)
@@ -269,7 +269,7 @@ def test_overlapping_particles_are_separated_and_a_single_one_is_not_split(view:
     np.testing.assert_allclose(residual, image - image_of(view, found), atol=1e-6)
     one = np.array([[0.2, 0.1, 2.0, 9e5]])
     residual = np.zeros(view.camera.rows * view.camera.columns)
-    partners = split(observed(view, residual, np.ones_like(residual)), one, np.array([True]), 1e5, 1.0)
+    partners = split(observed(view, residual, np.ones_like(residual)), one, np.array([True]), 1e5, np.array([1.0]))
     assert not partners.any()
     np.testing.assert_allclose(residual, 0.0, atol=1e-9)
 

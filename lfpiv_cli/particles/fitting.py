@@ -461,6 +461,45 @@ def _add_all(
         add_light(pixels, values, sign * particles[number, 3], image)
 
 
+def light_errors(observation: Observation, particles: Floats, model: Floats) -> tuple[Floats, Floats]:
+    """Return how wrong the light of each particle (n,) is, the square of the share, and that light's own square (n,).
+
+    Squares are in variances of pixels. Noise differs from pixel to pixel; what the model of light lacks is alike in
+    pixels side by side, whose products tell it: in the mean 0 where there is noise alone, and below as above it.
+    """
+    error2, power = np.zeros(len(particles)), np.zeros(len(particles))
+    arguments = observation, particles, model, error2, power
+    over_tiles(_write_light_errors, observation.optics, particles, observation.depths_mm, *arguments)
+    return error2, power
+
+
+@njit(cache=True, nogil=True)
+def _write_light_errors(
+    numbers: NDArray[np.int64],
+    observation: Observation,
+    particles: Floats,
+    model: Floats,
+    error2: Floats,
+    power: Floats,
+) -> None:
+    """Do the work of `light_errors` for the particles of a tile."""
+    residual, weight = observation.residual, observation.weight
+    responses = room_for(1, observation.capacity, 0)
+    for number in numbers:
+        observation.respond(observation.optics, particles[number : number + 1], responses)
+        pixels, values = lit_by(responses, 0)
+        alike = light = 0.0
+        for k in range(pixels.size):
+            f, pixel = values[0, k], pixels[k]
+            power[number] += weight[pixel] * (particles[number, 3] * f) ** 2
+            light += f * weight[pixel] * model[pixel] ** 2
+            if pixel + 1 < residual.size:
+                both = np.sqrt(weight[pixel] * weight[pixel + 1])
+                alike += f * both * residual[pixel] * residual[pixel + 1]
+        if light > 0.0:
+            error2[number] = alike / light
+
+
 def judge(observation: Observation, particles: Floats) -> tuple[Floats, Floats, Floats, Floats]:
     """Return local chi-squared, claimed share, counts in the brightest pixel and share that is seen of each particle.
 

@@ -7,7 +7,8 @@ tracers a third of a microlens apart differ from one by thousands. Two that over
 as bright as two: what would be brighter than others stays two, unless they are in one place, where no two solid tracers
 can be.
 
-In one place near the focal plane there is one particle, unless two are expected: what the model of the light of so few
+Where the model of light is wrong, what it leaves of particles that fit well is allowed for, see `suspects.lacking`. In
+one place near the focal plane there is one particle, unless two are expected: what the model of the light of so few
 lenses lacks is as much as what tells two from one.
 
 Axes: image axes, mm; light in counts; residual and weights as flat images. A particle is a row (x, y, z, light).
@@ -151,12 +152,13 @@ STEPS = 12
 LEAST_LIGHT = 1e-9
 
 
-def with_twins_joined(task: Task, state: State, unexplained: float, chi2: Floats) -> State:
+def with_twins_joined(task: Task, state: State, unexplained: float, chi2: Floats, lacks: Floats | float = 0.0) -> State:
     """Return the state with one particle for two that the image does not tell from one.
 
     Parameters
     ----------
     chi2 : of its particles, see `judge`, to tell how large a good one's is
+    lacks : (n,) what the model of light lacks of each, see `suspects.lacking`
     """
     if len(state.particles) < 2:
         return state
@@ -181,7 +183,8 @@ def with_twins_joined(task: Task, state: State, unexplained: float, chi2: Floats
     if not len(pairs):
         return state
 
-    joined = join(observed(task, state, unexplained), particles, pairs, loss * good_chi2(chi2), brightest)
+    largest = np.maximum(loss * good_chi2(chi2), np.broadcast_to(lacks, len(particles))[pairs].sum(axis=1))
+    joined = join(observed(task, state, unexplained), particles, pairs, largest, brightest)
     stays, expected = np.ones(len(particles), np.bool_), state.prior
     stays[pairs[joined, 1]], expected[pairs[joined, 0]] = False, nothing_expected(1)
     return replace(state, particles=particles[stays], expected=expected[stays])

@@ -39,7 +39,7 @@ from lfpiv_cli.particles.search import (
     with_typical_light,
 )
 from lfpiv_cli.particles.stated import Particles, result
-from lfpiv_cli.particles.suspects import good_chi2, with_depths_corrected, with_overlaps_split
+from lfpiv_cli.particles.suspects import good_chi2, lacking, with_depths_corrected, with_overlaps_split
 from lfpiv_cli.particles.view import lens_pixels
 
 
@@ -180,10 +180,15 @@ def separated(task: Task, state: State, settings: Round, to_noise: bool) -> tupl
     return state, good
 
 
-def with_suspects_tried(task: Task, state: State, fits: Fits, unexplained: float, good: float) -> State:
-    """Return the state after all that fit worse than `good` were tried as two, and before that at other depths."""
+def with_suspects_tried(
+    task: Task, state: State, fits: Fits, unexplained: float, good: float, lacks: Floats | float = 0.0
+) -> State:
+    """Return the state after all that fit worse than `good` were tried as two, and before that at other depths.
+
+    `lacks` is what the model of light lacks of each, see `lacking`.
+    """
     state = with_depths_corrected(task, state, fits.chi2, unexplained, good)
-    return with_overlaps_split(task, state, fits.chi2, unexplained, good, thorough=True)
+    return with_overlaps_split(task, state, fits.chi2, unexplained, good, thorough=True, lacks=lacks)
 
 
 def concluded(task: Task, state: State, settings: Round) -> State:
@@ -195,13 +200,15 @@ def concluded(task: Task, state: State, settings: Round) -> State:
         state = with_measured_noise(task, state)
         sweep(task, state, LAST_UNEXPLAINED, LAST_SWEEPS)
         before = len(state.particles)
-        state = with_twins_joined(task, state, LAST_UNEXPLAINED, judged(task, state, LAST_UNEXPLAINED).chi2)
+        lacks = lacking(task, state, LAST_UNEXPLAINED)
+        state = with_twins_joined(task, state, LAST_UNEXPLAINED, judged(task, state, LAST_UNEXPLAINED).chi2, lacks)
         if number == MOST_JOINS - 1 or before - len(state.particles) <= HARDLY_ANY * before:
             break
         sweep(task, state, LAST_UNEXPLAINED, LAST_SWEEPS)
         fits = judged(task, state, LAST_UNEXPLAINED)
         state = replace(state, unsplit=state.unsplit[:0])
-        state = with_suspects_tried(task, state, fits, LAST_UNEXPLAINED, good_chi2(fits.chi2))
+        lacks = lacking(task, state, LAST_UNEXPLAINED)
+        state = with_suspects_tried(task, state, fits, LAST_UNEXPLAINED, good_chi2(fits.chi2), lacks)
     return pruned(task, state, settings)[0]
 
 
