@@ -61,9 +61,16 @@ class Kernel(_Compiled):
 
 
 def njit(*, cache: bool = False, **options: Any) -> Callable[[Callable[..., Any]], Any]:
-    """Return a decorator that compiles functions as numba's of this name does, with its options."""
+    """Return a decorator that compiles functions as numba's of this name does, with its options.
+
+    Raises
+    ------
+    TypeError : twice for one function: a function that was put below another's decorator leaves that to Python
+    """
 
     def compiled(function: Callable[..., Any]) -> Any:
+        if isinstance(function, CPUDispatcher):
+            raise TypeError(f"{function.__name__}: compiled twice; one of the decorators is another function's")
         if config.DISABLE_JIT:
             return function
         kernel = Kernel(function, None, {"nopython": True, "boundscheck": None, **options})

@@ -49,6 +49,12 @@ def test_a_function_is_compiled_for_python_where_python_calls_it() -> None:
 
 
 @pytest.mark.skipif(config.DISABLE_JIT, reason="nothing is compiled")
+def test_a_function_that_takes_anothers_decorator_is_refused() -> None:
+    with pytest.raises(TypeError, match="total: compiled twice"):
+        njit()(total)
+
+
+@pytest.mark.skipif(config.DISABLE_JIT, reason="nothing is compiled")
 def test_errors_come_out_of_what_kernels_call() -> None:
     assert half_of_share(9, 2) == 2
     with pytest.raises(ZeroDivisionError):
