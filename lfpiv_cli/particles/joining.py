@@ -183,7 +183,7 @@ def with_twins_joined(task: Task, state: State, unexplained: float, chi2: Floats
     if not len(pairs):
         return state
 
-    largest = np.maximum(loss * good_chi2(chi2), np.broadcast_to(lacks, len(particles))[pairs].sum(axis=1))
+    largest = np.maximum(loss * good_chi2(chi2), np.full(len(particles), lacks)[pairs].sum(axis=1))
     joined = join(observed(task, state, unexplained), particles, pairs, largest, brightest)
     stays, expected = np.ones(len(particles), np.bool_), state.prior
     stays[pairs[joined, 1]], expected[pairs[joined, 0]] = False, nothing_expected(1)

@@ -215,7 +215,7 @@ def with_overlaps_split(
     signature = _signature(task.view.scale, state.particles, chi2)
     suspects = bright & (chi2 > SUSPECT_CHI2 * good) & ~_tried(state.unsplit, state, signature)
     light = SMALLEST_LIGHT * state.typical_light
-    least = np.broadcast_to(np.maximum(SPLIT_GAIN * good, lacks), len(state.particles)).copy()
+    least = np.full(len(state.particles), np.maximum(SPLIT_GAIN * good, lacks))
     partners = split(observation, state.particles, suspects, light, least)
     found = partners[:, 3] > 0.0
     return replace(
