@@ -2,10 +2,9 @@
 
 A particle that was found in a neighbour frame and has no partner here is put where the displacements around it lead,
 whether its light seems free or not; then all particles are refined, and those that do not find their light are
-dropped. So overlapping particles that splitting did not find are separated; only those without a partner are suspected
-of being two, or elsewhere. Only first passes serve as neighbours, and of a pair the second frame's first pass begins
-with the first frame's, never the other way round (`second_frame`): each frame's result depends on the images alone,
-not on the order in which frames are done.
+dropped. So overlapping particles that splitting did not find are separated. Only first passes serve as neighbours, and
+of a pair the second frame's first pass begins with the first frame's, never the other way round (`second_frame`): each
+frame's result depends on the images alone, not on the order in which frames are done.
 
 Axes: particles are rows (x, y, z, light) in image axes, mm and counts.
 """
@@ -51,7 +50,7 @@ from lfpiv_cli.particles.search import (
     with_measured_noise,
     with_typical_light,
 )
-from lfpiv_cli.particles.suspects import SUSPECT_CHI2, good_chi2, settled
+from lfpiv_cli.particles.suspects import good_chi2
 from lfpiv_cli.tracks.candidates import Light, Seen
 from lfpiv_cli.tracks.tracking import expected_of, known_of, reach_of, track
 
@@ -115,7 +114,6 @@ def find_predicted(task: Task, predicted: Predicted, progress: Callable[[int], N
     state = continued(task, expected)
     if not len(expected.particles) or len(state.particles) < LEAST_FOUND * len(expected.particles):
         return None
-    state = settled(task, state, state.particles)
     for settings in SEARCHES:
         candidates, light = candidates_of(task, state, settings.iterations, progress)
         state = accepted(task, *with_candidates(task, state, candidates, light), settings)
@@ -161,8 +159,8 @@ def continued(task: Task, predicted: Predicted) -> State:
 # Axes: particles are rows (x, y, z, light) in image axes, mm and counts.
 
 
-# A particle is beyond doubt that is no suspect and finds this share of the light that it claims.
-TRUSTED_SHARE = 0.98
+# A particle is beyond doubt that fits nearly as well as good ones, and finds this share of the light that it claims.
+TRUSTED_CHI2, TRUSTED_SHARE = 1.5, 0.98
 # A place is expected well enough with a standard error of this: laterally in microlenses, in depths over which light
 # spreads by one lens (Table 2: 0.02 and 0.1 mm). Beyond, a particle may end at a neighbour's place.
 EXPECTED_LENSES, EXPECTED_DEPTHS = 0.2, 0.1 / 1.064
@@ -197,7 +195,7 @@ def beyond_doubt(task: Task, particles: Floats) -> NDArray[np.bool_]:
     state = rebuilt(task, blank(task), particles)
     state = with_measured_noise(task, with_typical_light(task, state, judged(task, state, LAST_UNEXPLAINED)))
     fits = judged(task, state, LAST_UNEXPLAINED)
-    return np.asarray((fits.chi2 < SUSPECT_CHI2 * good_chi2(fits.chi2)) & (fits.share > TRUSTED_SHARE))
+    return np.asarray((fits.chi2 < TRUSTED_CHI2 * good_chi2(fits.chi2)) & (fits.share > TRUSTED_SHARE))
 
 
 def predicted_by(trusted: Floats, seen: Floats, scale: Scale) -> Predicted:
@@ -240,8 +238,7 @@ def second_pass(task: Task, own: Floats, neighbours: Sequence[Floats]) -> State:
     state = rebuilt(task, blank(task), own)
     state = with_typical_light(task, state, judged(task, state, LAST_UNEXPLAINED))
     state = with_measured_noise(task, replace(state, noise=noise_with(task, state.typical_light)))
-    missing, partnered = _missing_particles(task, own, neighbours)
-    state = settled(task, rebuilt(task, state, np.concatenate([own, missing])), own[partnered])
+    state = rebuilt(task, state, np.concatenate([own, _missing_particles(task, own, neighbours)]))
     for sweeps, unexplained in REFINING:
         sweep(task, state, unexplained, sweeps, SEARCH_GAIN)
     # Three may be where two are, one of them found here for both: with the third beside them chi-squared needs all.
@@ -249,11 +246,9 @@ def second_pass(task: Task, own: Floats, neighbours: Sequence[Floats]) -> State:
     return finished(task, state, ROUNDS[-1])
 
 
-def _missing_particles(task: Task, own: Floats, neighbours: Sequence[Floats]) -> tuple[Floats, NDArray[np.bool_]]:
-    """Return the neighbours' particles (m, 4) that are missing here, where they are expected, and which own ones (n,)
-    have partners among them.
-    """
-    scale, missing, partnered = task.view.scale, np.zeros((0, 4)), np.zeros(len(own), np.bool_)
+def _missing_particles(task: Task, own: Floats, neighbours: Sequence[Floats]) -> Floats:
+    """Return the neighbours' particles (m, 4) that are missing here, where they are expected."""
+    scale, missing = task.view.scale, np.zeros((0, 4))
     same = scale.box_mm(SAME_LENSES, SAME_DEPTHS)
     for other in neighbours:
         there, here = (Seen(each[:, :3], light=Light(each[:, 3])) for each in (other, own))
@@ -276,5 +271,4 @@ def _missing_particles(task: Task, own: Floats, neighbours: Sequence[Floats]) ->
             _, back = KDTree(points).query(others)
             seen &= ~((distance <= 1.0) & (back[to] == np.arange(len(points))))
         missing = np.concatenate([missing, expected[seen]])
-        partnered |= ~partnerless
-    return missing * (1.0, 1.0, 1.0, FIRST_SHARE), partnered
+    return missing * (1.0, 1.0, 1.0, FIRST_SHARE)

@@ -17,7 +17,14 @@ import numpy as np
 
 from lfpiv_cli.arrays import Floats
 from lfpiv_cli.particles.fitting import Least, accept, judge
-from lfpiv_cli.particles.joining import boxes_of, explain_rest, find_peaks, points_in_raw_frame, with_twins_joined
+from lfpiv_cli.particles.joining import (
+    LARGEST_LOSS,
+    boxes_of,
+    explain_rest,
+    find_peaks,
+    points_in_raw_frame,
+    with_twins_joined,
+)
 from lfpiv_cli.particles.least_squares import SEARCH_GAIN
 from lfpiv_cli.particles.refraction import places_by_snell
 from lfpiv_cli.particles.search import (
@@ -39,7 +46,7 @@ from lfpiv_cli.particles.search import (
     with_typical_light,
 )
 from lfpiv_cli.particles.stated import Particles, result
-from lfpiv_cli.particles.suspects import good_chi2, lacking, with_depths_corrected, with_overlaps_split
+from lfpiv_cli.particles.suspects import SPLIT_GAIN, good_chi2, lacking, with_depths_corrected, with_overlaps_split
 from lfpiv_cli.particles.view import lens_pixels
 
 
@@ -166,8 +173,6 @@ def separated(task: Task, state: State, settings: Round, to_noise: bool) -> tupl
             state = accepted(task, state, candidates, replace(settings, unexplained=LAST_UNEXPLAINED))
             sweep(task, state, LAST_UNEXPLAINED, LAST_SWEEPS)
             found = len(state.particles) > before
-        # What could not be split may be any time.
-        state = replace(state, unsplit=state.unsplit[:0])
         fits = judged(task, state, LAST_UNEXPLAINED)
         good = good_chi2(fits.chi2)
         if to_noise and good > max(NEXT_TO_NOISE, LEAST_PROGRESS * good_before):
@@ -181,20 +186,27 @@ def separated(task: Task, state: State, settings: Round, to_noise: bool) -> tupl
 
 
 def with_suspects_tried(
-    task: Task, state: State, fits: Fits, unexplained: float, good: float, lacks: Floats | float = 0.0
+    task: Task,
+    state: State,
+    fits: Fits,
+    unexplained: float,
+    good: float,
+    gain: float = SPLIT_GAIN,
+    lacks: Floats | float = 0.0,
 ) -> State:
     """Return the state after all that fit worse than `good` were tried as two, and before that at other depths.
 
-    `lacks` is what the model of light lacks of each, see `lacking`.
+    `gain` and `lacks` as in `with_overlaps_split`.
     """
     state = with_depths_corrected(task, state, fits.chi2, unexplained, good)
-    return with_overlaps_split(task, state, fits.chi2, unexplained, good, thorough=True, lacks=lacks)
+    return with_overlaps_split(task, state, fits.chi2, unexplained, good, thorough=True, gain=gain, lacks=lacks)
 
 
 def concluded(task: Task, state: State, settings: Round) -> State:
     """Return the state with those joined that the noise does not tell apart, without those that do not hold.
 
-    Joined ones leave the others other light: again, until hardly any are joined.
+    Joined ones leave the others other light: again, until hardly any are joined. What is split then must gain what two
+    that are joined may lose, or the two would go to and fro.
     """
     for number in range(MOST_JOINS):
         state = with_measured_noise(task, state)
@@ -206,9 +218,9 @@ def concluded(task: Task, state: State, settings: Round) -> State:
             break
         sweep(task, state, LAST_UNEXPLAINED, LAST_SWEEPS)
         fits = judged(task, state, LAST_UNEXPLAINED)
-        state = replace(state, unsplit=state.unsplit[:0])
         lacks = lacking(task, state, LAST_UNEXPLAINED)
-        state = with_suspects_tried(task, state, fits, LAST_UNEXPLAINED, good_chi2(fits.chi2), lacks)
+        good = good_chi2(fits.chi2)
+        state = with_suspects_tried(task, state, fits, LAST_UNEXPLAINED, good, LARGEST_LOSS, lacks)
     return pruned(task, state, settings)[0]
 
 

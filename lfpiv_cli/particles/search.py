@@ -189,7 +189,6 @@ class State:
     typical_light : of a particle
     noise : of the image
     unsplit, unmoved : (m, 5) those that could not be split, and not be moved in depth, as `_signature` gives them
-    settled : (m, 4) those that are suspected of neither, whatever their chi-squared; without it
     expected : (m, 8) what is known beforehand of the first m particles, see `least_squares.fit`
     """
 
@@ -199,7 +198,6 @@ class State:
     noise: Noise
     unsplit: Floats
     unmoved: Floats
-    settled: Floats
     expected: Floats
 
     @property
@@ -262,7 +260,7 @@ def _depths_mm(view: View, low_mm: float, high_mm: float) -> tuple[float, float]
 def blank(task: Task) -> State:
     """Return the state in which nothing has been found."""
     nobody, none, noise = np.zeros((0, 4)), np.zeros((0, 5)), noise_with(task, 0.0)
-    return State(nobody, task.light.copy(), 0.0, noise, none, none, nobody, nothing_expected(0))
+    return State(nobody, task.light.copy(), 0.0, noise, none, none, nothing_expected(0))
 
 
 def noise_with(task: Task, typical_light: float) -> Noise:

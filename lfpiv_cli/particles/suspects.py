@@ -49,10 +49,9 @@ STARTS = np.array(
         (0.0, 0.0, 1.0 / 1.064),
     ]
 )
-# Steps from every start. The best ones are fitted on, so many steps at most, if they have by then gained this share of
-# what is asked for.
+# Steps from every start. The best one is fitted on, so many steps at most, if it has by then gained this share of what
+# is asked for.
 FIRST_STEPS = 4
-FINALISTS = 2
 PAIR_STEPS = 12
 FIRST_GAIN = 0.25
 
@@ -72,7 +71,7 @@ def split(
     partners, fitter = np.zeros_like(particles), fitter_of(observation)
     places = footprint_px(observation.optics, *observation.depths_mm) * observation.optics.camera.columns
     first, then = Effort(FIRST_STEPS, CHOICE_GAIN), Effort(PAIR_STEPS, CHOICE_GAIN)
-    choice = Choice(first, then, FINALISTS, smallest_light, np.inf)
+    choice = Choice(first, then, 1, smallest_light, np.inf)
     arguments = fitter, particles, places, choice, smallest_gain, partners
     over_tiles(_split, observation.optics, particles, observation.depths_mm, *arguments, chosen=suspects)
     return partners
@@ -134,7 +133,7 @@ def _split(
 # Starts relative to the particle's depth, in depths over which light spreads by one lens (Table 2: 0.2 to 2 mm); its
 # mirrored depth is another.
 OTHER_DEPTHS = np.array([-2.0, -1.5, -1.0, -0.7, -0.4, -0.2, 0.2, 0.4, 0.7, 1.0, 1.5, 2.0]) / 1.064
-STEPS = 14
+STEPS, FINALISTS = 14, 2
 
 
 def try_other_depths(
@@ -158,15 +157,17 @@ def try_other_depths(
     return fit_again(observation, particles, suspects, effort, elsewhere, prior).moved
 
 
-# Particles that fit worse than good ones by this factor are suspects.
+# Suspects are particles that fit worse than the noise predicts, and by this factor where good ones do, too.
 SUSPECT_CHI2 = 1.5
 # Light that stays within about one lens fits well at many depths: radii, in lenses, of footprints near the focal plane.
 # Elsewhere hardly one in a hundred suspects finds another depth: it must fit worse by this factor.
 NEAR_FOCUS_LENSES, ELSEWHERE_CHI2 = 0.6, 3.0
 # Suspected to be two: brighter than typical by this factor, or, in thorough rounds, bright enough for two.
 BRIGHT, ENOUGH_FOR_TWO = 1.2, 2.0 * SMALLEST_LIGHT
-# What chi-squared must fall by, in units of a good particle's, where one becomes two, and where it changes its depth.
-SPLIT_GAIN, DEPTH_GAIN = 40.0, 10.0
+# What chi-squared must fall by where one becomes two: little more than by noise, as their neighbours give way to two
+# only afterwards, and two that are one are joined then; and many times what good ones have beyond the noise. And where
+# one changes its depth, in units of a good particle's.
+SPLIT_GAIN, SPLIT_GAIN_BEYOND, DEPTH_GAIN = 8.0, 40.0, 10.0
 # And where the model of light is wrong, so many times what it leaves of those that fit well: by others it leaves more.
 # Of tracers of eight points by waves, up to 4 % of whose light is elsewhere, from 40 to 100 as few are found as two.
 MODEL_GAIN = 50.0
@@ -174,8 +175,6 @@ MODEL_GAIN = 50.0
 # microlenses, in depths over which light spreads by one lens (Table 2: 0.05 mm), and by these shares in light and in
 # chi-squared.
 CHANGED_LENSES, CHANGED_DEPTHS, CHANGED_SHARES = 0.05, 0.05 / 1.064, (0.05, 0.2)
-# One that is settled stays so until it has changed so many times as much.
-SETTLED = 4.0
 
 
 def with_depths_corrected(task: Task, state: State, chi2: Floats, unexplained: float, good: float) -> State:
@@ -186,15 +185,10 @@ def with_depths_corrected(task: Task, state: State, chi2: Floats, unexplained: f
     observation = observed(task, state, unexplained)
     near_focus = footprint_radius_mm(task.view, state.particles) < NEAR_FOCUS_LENSES * 2.0 * task.view.half_x_mm
     signature = _signature(task.view.scale, state.particles, chi2)
-    suspects = (near_focus | (chi2 > ELSEWHERE_CHI2 * good)) & ~_tried(state.unmoved, state, signature)
+    suspects = (near_focus | (chi2 > ELSEWHERE_CHI2 * good)) & ~_tried(state.unmoved, signature)
     light = SMALLEST_LIGHT * state.typical_light
     moved = try_other_depths(observation, state.particles, suspects, light, DEPTH_GAIN * good, state.prior)
     return replace(state, unmoved=np.concatenate([state.unmoved, signature[suspects & ~moved]]))
-
-
-def settled(task: Task, state: State, particles: Floats) -> State:
-    """Return the state in which these particles (m, 4) are not suspected while they stay there: other frames tell."""
-    return replace(state, settled=_signature(task.view.scale, particles, np.ones(len(particles)))[:, :-1])
 
 
 def with_overlaps_split(
@@ -204,18 +198,20 @@ def with_overlaps_split(
     unexplained: float,
     good: float,
     thorough: bool,
+    gain: float = SPLIT_GAIN,
     lacks: Floats | float = 0.0,
 ) -> State:
     """Return the state with overlapping particles separated; `thorough`: also those of usual brightness.
 
-    `good` is chi-squared of those that fit well, `lacks` see `lacking`.
+    `good` is chi-squared of those that fit well, `gain` what two must lower it by where the model of light is right,
+    `lacks` see `lacking`.
     """
     observation = observed(task, state, unexplained)
     bright = state.particles[:, 3] > (ENOUGH_FOR_TWO if thorough else BRIGHT) * state.typical_light
     signature = _signature(task.view.scale, state.particles, chi2)
-    suspects = bright & (chi2 > SUSPECT_CHI2 * good) & ~_tried(state.unsplit, state, signature)
+    suspects = bright & (chi2 > 1.0 + SUSPECT_CHI2 * (good - 1.0)) & ~_tried(state.unsplit, signature)
     light = SMALLEST_LIGHT * state.typical_light
-    least = np.full(len(state.particles), np.maximum(SPLIT_GAIN * good, lacks))
+    least = np.full(len(state.particles), np.maximum(gain + SPLIT_GAIN_BEYOND * (good - 1.0), lacks))
     partners = split(observation, state.particles, suspects, light, least)
     found = partners[:, 3] > 0.0
     return replace(
@@ -248,18 +244,9 @@ def _signature(scale: Scale, particles: Floats, chi2: Floats) -> Floats:
     return np.column_stack([particles[:, :3] / scale.box_mm(CHANGED_LENSES, CHANGED_DEPTHS), shares])
 
 
-def _settled(state: State, signature: Floats) -> NDArray[np.bool_]:
-    return _among(state.settled / SETTLED, signature[:, :-1] / SETTLED)
-
-
-def _tried(before: Floats, state: State, signature: Floats) -> NDArray[np.bool_]:
-    """Return which particles were tried before or are settled, and have hardly changed since."""
-    return _among(before, signature) | _settled(state, signature)
-
-
-def _among(tried: Floats, signature: Floats) -> NDArray[np.bool_]:
-    """Return which signatures are among others, within 1."""
-    if not len(tried):
+def _tried(before: Floats, signature: Floats) -> NDArray[np.bool_]:
+    """Return which particles were tried before and have hardly changed since."""
+    if not len(before):
         return np.zeros(len(signature), dtype=bool)
-    distance, _ = KDTree(tried).query(signature, p=np.inf, distance_upper_bound=1.0)
+    distance, _ = KDTree(before).query(signature, p=np.inf, distance_upper_bound=1.0)
     return np.isfinite(distance)
