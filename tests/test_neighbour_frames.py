@@ -84,6 +84,15 @@ def test_what_is_predicted_and_the_rest_are_found_and_what_is_not_there_goes(tas
     assert found(state.particles, true[[0, -1]]).all()
 
 
+@pytest.mark.thorough
+def test_two_that_every_frame_before_took_for_one_become_two(task: Task, true: Floats) -> None:
+    as_one = 0.5 * (true[0] + true[-1])
+    as_one[3] *= 2.0
+    state = find_predicted(task, predicted(np.concatenate([true[1:-1], [as_one]])))
+    assert found(state.particles, true[[0, -1]]).all()
+    assert len(state.particles) == len(true)
+
+
 def test_predictions_that_fit_nothing_are_refused(task: Task, true: Floats) -> None:
     elsewhere = np.random.default_rng(7).uniform((-1.0, -0.8, 1.0, 4e5), (1.0, 0.8, 2.8, 6e5), (45, 4))
     assert find_predicted(task, predicted(elsewhere)) is None

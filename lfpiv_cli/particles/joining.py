@@ -143,8 +143,8 @@ def points_in_raw_frame(weights: Weights, index_xyz: Floats) -> Floats:
 APART_LENSES, APART_DEPTHS = 1.0, 1.0 / 1.064
 # Radii, in lenses, of footprints near the focal plane.
 NEAR_FOCUS_LENSES = 1.0
-# What chi-squared may rise by, in units of a good particle's: five standard errors of the light of the second.
-LARGEST_LOSS = 25.0
+# What chi-squared may rise by, in units of a good particle's: six standard errors of the light of the second.
+LARGEST_LOSS = 40.0
 # One in twenty particles is brighter than what two may be joined to.
 BRIGHTEST_PERCENTILE = 95.0
 STEPS = 12
