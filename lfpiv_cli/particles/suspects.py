@@ -27,7 +27,7 @@ from lfpiv_cli.particles.least_squares import (
     room_for,
 )
 from lfpiv_cli.particles.search import GOOD_PERCENTILE, SMALLEST_LIGHT, State, Task, observed, usual_chi2
-from lfpiv_cli.particles.view import footprint_px, footprint_radius_mm, over_tiles
+from lfpiv_cli.particles.view import by_waves, footprint_px, footprint_radius_mm, over_tiles
 
 # Overlapping particle images: two particles where one was found, if two explain the light much better.
 #
@@ -165,9 +165,10 @@ NEAR_FOCUS_LENSES, ELSEWHERE_CHI2 = 0.6, 3.0
 # Suspected to be two: brighter than typical by this factor, or, in thorough rounds, bright enough for two.
 BRIGHT, ENOUGH_FOR_TWO = 1.2, 2.0 * SMALLEST_LIGHT
 # What chi-squared must fall by where one becomes two: little more than by noise, as their neighbours give way to two
-# only afterwards, and two that are one are joined then; and many times what good ones have beyond the noise. And where
-# one changes its depth, in units of a good particle's.
-SPLIT_GAIN, SPLIT_GAIN_BEYOND, DEPTH_GAIN = 8.0, 40.0, 10.0
+# only afterwards, and two that are one are joined then; and many times what good ones have beyond the noise. Tables of
+# light by waves lack up to half a percent of it, which several explain one after the other. And where one changes its
+# depth, in units of a good particle's.
+SPLIT_GAIN, SPLIT_GAIN_BY_WAVES, SPLIT_GAIN_BEYOND, DEPTH_GAIN = 8.0, 40.0, 40.0, 10.0
 # And where the model of light is wrong, so many times what it leaves of those that fit well: by others it leaves more.
 # Of tracers of eight points by waves, up to 4 % of whose light is elsewhere, from 40 to 100 as few are found as two.
 MODEL_GAIN = 50.0
@@ -211,7 +212,8 @@ def with_overlaps_split(
     signature = _signature(task.view.scale, state.particles, chi2)
     suspects = bright & (chi2 > 1.0 + SUSPECT_CHI2 * (good - 1.0)) & ~_tried(state.unsplit, signature)
     light = SMALLEST_LIGHT * state.typical_light
-    least = np.full(len(state.particles), np.maximum(gain + SPLIT_GAIN_BEYOND * (good - 1.0), lacks))
+    at_least = max(gain, SPLIT_GAIN_BY_WAVES) if by_waves(task.view) else gain
+    least = np.full(len(state.particles), np.maximum(at_least + SPLIT_GAIN_BEYOND * (good - 1.0), lacks))
     partners = split(observation, state.particles, suspects, light, least)
     found = partners[:, 3] > 0.0
     return replace(
