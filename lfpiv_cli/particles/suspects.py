@@ -157,7 +157,7 @@ def try_other_depths(
     return fit_again(observation, particles, suspects, effort, elsewhere, prior).moved
 
 
-# Suspects are particles that fit worse than the noise predicts, and by this factor where good ones do, too.
+# Suspects fit worse than the noise predicts, and so many times as much worse as good ones where these do, too.
 SUSPECT_CHI2 = 1.5
 # Light that stays within about one lens fits well at many depths: radii, in lenses, of footprints near the focal plane.
 # Elsewhere hardly one in a hundred suspects finds another depth: it must fit worse by this factor.
