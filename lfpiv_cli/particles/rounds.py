@@ -46,7 +46,7 @@ from lfpiv_cli.particles.search import (
     with_typical_light,
 )
 from lfpiv_cli.particles.stated import Particles, result
-from lfpiv_cli.particles.suspects import SPLIT_GAIN, good_chi2, lacking, with_depths_corrected, with_overlaps_split
+from lfpiv_cli.particles.suspects import good_chi2, lacking, with_depths_corrected, with_overlaps_split
 from lfpiv_cli.particles.view import lens_pixels
 
 
@@ -186,20 +186,14 @@ def separated(task: Task, state: State, settings: Round, to_noise: bool) -> tupl
 
 
 def with_suspects_tried(
-    task: Task,
-    state: State,
-    fits: Fits,
-    unexplained: float,
-    good: float,
-    gain: float = SPLIT_GAIN,
-    lacks: Floats | float = 0.0,
+    task: Task, state: State, fits: Fits, unexplained: float, good: float, least: Floats | float = 0.0
 ) -> State:
     """Return the state after all that fit worse than `good` were tried as two, and before that at other depths.
 
-    `gain` and `lacks` as in `with_overlaps_split`.
+    `least` is what two must lower chi-squared by at least, of each or of all.
     """
     state = with_depths_corrected(task, state, fits.chi2, unexplained, good)
-    return with_overlaps_split(task, state, fits.chi2, unexplained, good, thorough=True, gain=gain, lacks=lacks)
+    return with_overlaps_split(task, state, fits.chi2, unexplained, good, thorough=True, least=least)
 
 
 def concluded(task: Task, state: State, settings: Round) -> State:
@@ -218,9 +212,9 @@ def concluded(task: Task, state: State, settings: Round) -> State:
             break
         sweep(task, state, LAST_UNEXPLAINED, LAST_SWEEPS)
         fits = judged(task, state, LAST_UNEXPLAINED)
-        lacks = lacking(task, state, LAST_UNEXPLAINED)
         good = good_chi2(fits.chi2)
-        state = with_suspects_tried(task, state, fits, LAST_UNEXPLAINED, good, LARGEST_LOSS, lacks)
+        least = np.maximum(lacking(task, state, LAST_UNEXPLAINED), LARGEST_LOSS * good)
+        state = with_suspects_tried(task, state, fits, LAST_UNEXPLAINED, good, least)
     return pruned(task, state, settings)[0]
 
 

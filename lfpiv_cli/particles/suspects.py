@@ -199,22 +199,20 @@ def with_overlaps_split(
     unexplained: float,
     good: float,
     thorough: bool,
-    gain: float = SPLIT_GAIN,
-    lacks: Floats | float = 0.0,
+    least: Floats | float = 0.0,
 ) -> State:
     """Return the state with overlapping particles separated; `thorough`: also those of usual brightness.
 
-    `good` is chi-squared of those that fit well, `gain` what two must lower it by where the model of light is right,
-    `lacks` see `lacking`.
+    `good` is chi-squared of those that fit well, `least` what two must lower it by at least, of each or of all.
     """
     observation = observed(task, state, unexplained)
     bright = state.particles[:, 3] > (ENOUGH_FOR_TWO if thorough else BRIGHT) * state.typical_light
     signature = _signature(task.view.scale, state.particles, chi2)
     suspects = bright & (chi2 > 1.0 + SUSPECT_CHI2 * (good - 1.0)) & ~_tried(state.unsplit, signature)
     light = SMALLEST_LIGHT * state.typical_light
-    at_least = max(gain, SPLIT_GAIN_BY_WAVES) if by_waves(task.view) else gain
-    least = np.full(len(state.particles), np.maximum(at_least + SPLIT_GAIN_BEYOND * (good - 1.0), lacks))
-    partners = split(observation, state.particles, suspects, light, least)
+    usual = SPLIT_GAIN_BY_WAVES if by_waves(task.view) else SPLIT_GAIN
+    gain = np.full(len(state.particles), np.maximum(usual + SPLIT_GAIN_BEYOND * (good - 1.0), least))
+    partners = split(observation, state.particles, suspects, light, gain)
     found = partners[:, 3] > 0.0
     return replace(
         state,
